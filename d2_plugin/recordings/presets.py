@@ -8,10 +8,8 @@
     protocol:4c4d                  N3DV as 4C4D trains it (Zhou et al., CVPR 2026, github.com/yangzf-1023/4C4D, default
                                    of scripts/n3v2blender.py): cam01 cam10 cam13 cam20; all others are scored
 
-A preset has one order by data set: three views are the two views and one camera more, so scores over the number of
-views compare like with like. Both published protocols use the first 300 frames at half size (1352 x 1014). The lists of
-the D²-4DGS paper are in a supplement that is not public: asking for them is refused with that sentence, since a list
-that was made up could be taken for the paper's.
+A preset has one order by data set: three views are the two views and one camera more. Both published protocols use the
+first 300 frames at half size (1352 x 1014). The lists of the D²-4DGS paper are in a supplement that is not public.
 """
 
 from __future__ import annotations

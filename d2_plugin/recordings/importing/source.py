@@ -14,7 +14,7 @@ from d2_plugin.errors import D2Error
 from d2_plugin.reading import shown_path
 from d2_plugin.recordings.cameras.camera import CalibratedCamera
 from d2_plugin.recordings.cameras.formats.cameras_json import camera_table, read_camera
-from d2_plugin.recordings.cameras.undistort import UndistortedSource, recorded_at
+from d2_plugin.recordings.cameras.undistort import UndistortedSource
 from d2_plugin.recordings.images import opencv
 from d2_plugin.recordings.importing.settings import ImportChoices, by_camera
 from d2_plugin.recordings.importing.video import VideoFile, VideoFrames
@@ -113,7 +113,10 @@ class VideosSource(Source):
         return self.cuts[camera].of(image)
 
     def recorded(self, camera: str) -> np.ndarray | None:
-        valid = valid_pixels(self.cameras[camera], self.cuts[camera])
+        whole = self._undistorted.recorded(camera)
+        if whole is None:
+            return None
+        valid = self.cuts[camera].of(whole.astype(np.float32)) > 0.99
         return None if valid.all() else valid
 
     def as_dict(self) -> dict[str, Any]:
@@ -139,11 +142,3 @@ class VideosSource(Source):
             {name: read_camera(entry["camera"], str(folder)) for name, entry in table.items()},
             {name: Cut(**entry["cut"]) for name, entry in table.items()},
         )
-
-
-def valid_pixels(camera: CalibratedCamera, cut: Cut) -> np.ndarray:
-    """Which pixels of what is left [h, w] were recorded by the camera, bool."""
-    width, height = cut.size
-    columns, rows = np.arange(width) + 0.5, np.arange(height) + 0.5
-    x, y = np.meshgrid(columns / width * cut.width + cut.left, rows / height * cut.height + cut.top)
-    return recorded_at(camera, np.stack([x, y], axis=-1))

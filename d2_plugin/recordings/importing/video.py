@@ -216,7 +216,13 @@ class Decoder:
         """
         frame = self._frame(index)
         if self.video.hdr:  # what is brighter than white paper, 203 candela per square metre, becomes white
-            frame = frame.reformat(format="rgb24", dst_color_trc=BT709, dst_color_primaries=BT709)
+            try:
+                frame = frame.reformat(format="rgb24", dst_color_trc=BT709, dst_color_primaries=BT709)
+            except TypeError:  # PyAV before it knew transfer functions
+                raise D2Error(
+                    f"{shown_path(self.video.path)} is HDR ({self.video.hdr}), which this PyAV cannot convert: run "
+                    "`pip install -U av`, or convert the video to BT.709"
+                ) from None
         return self.video.upright(frame.to_ndarray(format="rgb24"))
 
     def grey(self, index: int, long_side: int) -> np.ndarray:

@@ -92,25 +92,20 @@ def aligned(cameras: Mapping[str, Camera], onto: Mapping[str, Camera]) -> dict[s
 
     Rotations settle the turn because the centres of two cameras, or of several on a line, do not.
     """
-    rotation, scale, shift = similarity(cameras, onto)
-    laid = {}
-    for name, camera in cameras.items():
-        R = camera.T_camera_world[:3, :3] @ rotation.T
-        centre = scale * rotation @ camera.centre + shift
-        laid[name] = replace(camera, T_camera_world=rigid(R, -R @ centre))
-    return laid
-
-
-def similarity(cameras: Mapping[str, Camera], onto: Mapping[str, Camera]) -> tuple[np.ndarray, float, np.ndarray]:
-    """(R [3, 3], s, t [3]): x in the world of `cameras` is s R x + t in that of `onto`."""
     names = [name for name in cameras if name in onto]
     between = sum(onto[name].T_camera_world[:3, :3].T @ cameras[name].T_camera_world[:3, :3] for name in names)
     left, _, right = np.linalg.svd(between)
     rotation = left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right
     here, there = (np.stack([rig[name].centre for name in names]) for rig in (cameras, onto))
-    spread = np.linalg.norm(here - here.mean(axis=0))
-    scale = float(np.linalg.norm(there - there.mean(axis=0)) / spread) if spread > 0 else 1.0
-    return rotation, scale, there.mean(axis=0) - scale * rotation @ here.mean(axis=0)
+    middle, goal = here.mean(axis=0), there.mean(axis=0)
+    spread = np.linalg.norm(here - middle)
+    scale = float(np.linalg.norm(there - goal) / spread) if spread > 0 else 1.0
+    laid = {}
+    for name, camera in cameras.items():
+        R = camera.T_camera_world[:3, :3] @ rotation.T
+        centre = goal + scale * rotation @ (camera.centre - middle)
+        laid[name] = replace(camera, T_camera_world=rigid(R, -R @ centre))
+    return laid
 
 
 def differences(cameras: Mapping[str, Camera], onto: Mapping[str, Camera]) -> dict[str, tuple[float, float]]:
