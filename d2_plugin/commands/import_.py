@@ -15,5 +15,5 @@ def run(settings: ImportSettings) -> str:
     show_notes(recording.notes)
     sizes = sorted({(camera.width, camera.height) for camera in recording.cameras.values()})
     shown = ", ".join(f"{width}x{height}" for width, height in sizes)
-    about = f"{len(recording.cameras)} cameras, {len(recording.frames)} frames at {recording.fps:g} per second"
+    about = f"{len(recording.cameras)} cameras, {len(recording.frames)} frames at {recording.rate:g} per second"
     return f"{about}, {shown} pixels in {settings.output}\n`d2 doctor {settings.output}` says what it lacks"

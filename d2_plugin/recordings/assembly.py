@@ -28,8 +28,7 @@ from d2_plugin.values import shown
 
 log = logging.getLogger(__name__)
 
-BLACK_NOTED = 1e-3
-"""Black share of an undistorted image above which a note reports it."""
+BLACK_NOTED = 1e-3  # black share of an undistorted image above which a note reports it
 
 CORRECT = "correct the file, see docs/recordings.md"
 REPLACE = "replace the file or remove it"
@@ -46,14 +45,12 @@ class FolderSource(Source):
     valid: Mapping[str, Path]
 
     def image(self, camera: str, frame: int) -> np.ndarray:
-        """RGB uint8 [H, W, 3]."""
         path = self.images[camera].get(frame)
         if path is None:
             raise D2Error(f"camera {camera} has no frame {frame}: choose one of the recording's frames")
         return read_image(path)
 
     def depth(self, camera: str, frame: int) -> np.ndarray | None:
-        """True planar z float32 [H, W], 0 where unknown, or None."""
         path = self.depths.get(camera, {}).get(frame)
         if path is None:
             return None
@@ -61,17 +58,14 @@ class FolderSource(Source):
         return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
 
     def mono(self, camera: str, frame: int) -> np.ndarray | None:
-        """Monocular map float32 [h, w] exactly as stored (holes and NaN included), or None."""
         path = self.monos.get(camera, {}).get(frame)
         return None if path is None else _map(path, None)
 
     def mask(self, camera: str, frame: int) -> np.ndarray | None:
-        """How much each pixel is foreground, float32 [H, W] in 0..1, or None where nobody says."""
         path = self.masks.get(camera, {}).get(frame)
         return None if path is None else read_mask(path)
 
     def recorded(self, camera: str) -> np.ndarray | None:
-        """Which pixels were recorded, bool [H, W], or None where all were."""
         path = self.valid.get(camera)
         return None if path is None else read_mask(path) > 0.5
 

@@ -18,8 +18,7 @@ from d2_plugin.recordings.images import IMAGE_SUFFIXES
 
 FrameFiles = dict[int, Path]
 
-MOST_DIGITS = 9
-"""Of a frame number."""
+MOST_DIGITS = 9  # of a frame number
 
 _LAST_NUMBER = re.compile(r"(\d+)\D*$")
 _PREFIXED = re.compile(r"(?P<camera>.+)_(?P<frame>\d+)$")

@@ -21,11 +21,8 @@ MASK_FOLDERS = ("masks", "fmasks", "mask", "bgmtv2")
 order in which they are tried: this project's own, Diffuman4D's, EasyMocap's, ENeRF's and EasyVolcap's. White counts
 fully, grey in part."""
 
-VALID_FOLDER = "valid"
-"""valid/<camera>.png is black where nothing was recorded: undistorting leaves such pixels."""
-
-MOST_PIXELS = 1 << 28
-"""Larger images are refused before anything is decoded: 16384 x 16384."""
+VALID_FOLDER = "valid"  # valid/<camera>.png is black where nothing was recorded: undistorting leaves such pixels
+MOST_PIXELS = 1 << 28  # larger images are refused before anything is decoded: 16384 x 16384
 
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _PNG_RGBA = 6  # colour type in the header's byte 25

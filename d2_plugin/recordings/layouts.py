@@ -28,8 +28,7 @@ Reader = Callable[[Path, Optional[tuple[str, ...]], bool], Recording]  # noqa: U
 class Layout(NamedTuple):
     """One layout of recordings."""
 
-    recognised: Callable[[Path], bool]
-    """Whether a folder looks like this layout; it only asks which files are there."""
+    recognised: Callable[[Path], bool]  # whether a folder looks like this layout; it only asks which files are there
     open: Reader
 
 

@@ -2,17 +2,14 @@
 
     preset:4                       four views of the data set that the recording is recognised as; 2 and 3 alike
     preset:n3dv:4                  four views by the order of N3DV, whatever the recording is
-    protocol:ours-4                the same as preset:4
     protocol:gc-4dgs-2  -3  -4     N3DV as GC-4DGS trains it (Li et al. 2025, github.com/liyw420/GC-4DGS, its script
                                    scripts/pre_dynerf/pose2MVS.py): lists by scene, which count the recording's
                                    cameras in the order of their names; the first camera, cam00, is scored
     protocol:4c4d                  N3DV as 4C4D trains it (Zhou et al., CVPR 2026, github.com/yangzf-1023/4C4D, default
                                    of scripts/n3v2blender.py): cam01 cam10 cam13 cam20; all others are scored
 
-A preset has one order by data set: three views are the two views and one camera more, so scores over the number of
-views compare like with like. Both published protocols use the first 300 frames at half size (1352 x 1014). The lists of
-the D²-4DGS paper are in a supplement that is not public: asking for them is refused with that sentence, since a list
-that was made up could be taken for the paper's.
+A preset has one order by data set: three views are the two views and one camera more. Both published protocols use the
+first 300 frames at half size (1352 x 1014). The lists of the D²-4DGS paper are in a supplement that is not public.
 """
 
 from __future__ import annotations
@@ -24,14 +21,9 @@ from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.recordings import Recording, open_recording
 from d2_plugin.recordings.readers.n3dv import UNSYNCHRONISED
 
-ALL = ("all",)
-"""In place of camera names: every camera that is not held out trains."""
-
-PRESET, PROTOCOL = "preset:", "protocol:"
-"""How a text begins that stands in place of camera names."""
-
-PAPER = "d2-4dgs"
-"""Protocols whose names begin so are refused."""
+ALL = ("all",)  # in place of camera names: every camera that is not held out trains
+PRESET, PROTOCOL = "preset:", "protocol:"  # how a text begins that stands in place of camera names
+PAPER = "d2-4dgs"  # protocols whose names begin so are refused
 
 
 class Rig(NamedTuple):
@@ -39,8 +31,7 @@ class Rig(NamedTuple):
 
     order: tuple[str, ...]
     spare: tuple[str, ...]
-    held_out: tuple[str, ...]
-    """Never trained on: what dense-view comparisons test with."""
+    held_out: tuple[str, ...]  # never trained on: what dense-view comparisons test with
     source: str
 
 
@@ -79,15 +70,13 @@ GC_4DGS: dict[str, dict[int, tuple[int, ...]]] = {
 }
 """Places of the training cameras, from 0, in the sorted list of a scene's cameras, by number of views."""
 
-FEWEST_CAMERAS = 18
-"""Of a whole N3DV recording (coffee_martini): with fewer the places would mean other cameras."""
+FEWEST_CAMERAS = 18  # of a whole N3DV recording (coffee_martini): with fewer the places would mean other cameras
 
 CAMERAS_4C4D = ("cam01", "cam10", "cam13", "cam20")
 
 PROTOCOLS = {
     **{f"gc-4dgs-{views}": "GC-4DGS, scripts/pre_dynerf/pose2MVS.py" for views in VIEWS},
     "4c4d": "4C4D, default of scripts/n3v2blender.py",
-    **{f"ours-{views}": "this project's choice" for views in VIEWS},
 }
 """By name, where each is written."""
 
@@ -140,12 +129,10 @@ def camera_split(recording: Recording, text: str) -> CameraSplit:
     if name.startswith(PAPER):
         raise D2Error(
             "the camera lists of the D²-4DGS paper are in a supplement that is not public: choose "
-            f"{', '.join(PROTOCOL + one for one in PROTOCOLS)}, or name the training cameras"
+            f"preset:4, {', '.join(PROTOCOL + one for one in PROTOCOLS)}, or name the training cameras"
         )
     if name not in PROTOCOLS:
         raise unknown_name("protocol", name, PROTOCOLS)
-    if name.startswith("ours-"):
-        return _preset(recording, f"{PRESET}{name[-1]}")
     train = _trained_by_4c4d(recording) if name == "4c4d" else _trained_by_gc_4dgs(recording, int(name[-1]))
     others = tuple(one for one in recording.cameras if one not in train)
     test = others if name == "4c4d" else (min(recording.cameras),)
@@ -196,7 +183,7 @@ def _trained_by_gc_4dgs(recording: Recording, views: int) -> tuple[str, ...]:
     if scene is None:
         raise D2Error(
             f"protocol:gc-4dgs-{views} has lists for {', '.join(GC_4DGS)} of N3DV and not for '{recording.name}': "
-            "name the folder after its scene, or choose protocol:ours-2, -3 or -4"
+            "name the folder after its scene, or choose preset:2, preset:3 or preset:4"
         )
     cameras = sorted(recording.cameras)
     if len(cameras) < FEWEST_CAMERAS:

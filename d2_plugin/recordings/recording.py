@@ -35,8 +35,7 @@ class Exposure(NamedTuple):
     """How bright a camera sees what others see, per channel: its gain over their geometric mean."""
 
     gain: tuple[float, float, float]
-    error: tuple[float, float, float]
-    """Standard error."""
+    error: tuple[float, float, float]  # standard error
 
 
 class Source:
@@ -116,6 +115,12 @@ class Recording:
         self._known(camera)
         valid = self.source.recorded(camera)
         return None if valid is None else self._sized(valid, camera, self.frames[0], "valid region at frame")
+
+    @property
+    def rate(self) -> float:
+        """Frames per second of those that are here: of a choice of frames fewer than `fps`."""
+        seconds = self.seconds(self.frames[-1])
+        return (len(self.frames) - 1) / seconds if seconds > 0 else self.fps
 
     def seconds(self, frame: int, camera: str | None = None) -> float:
         """Time of a frame since the first one, in seconds; with `camera`, the instant at which that one took it."""

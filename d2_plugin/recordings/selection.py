@@ -68,25 +68,20 @@ class DownscaledSource(Source):
     factor: int
 
     def image(self, camera: str, frame: int) -> np.ndarray:
-        """RGB uint8 [H // factor, W // factor, 3]: the mean of each block."""
         return shrink_image(self.recording.image(camera, frame), self.factor)
 
     def depth(self, camera: str, frame: int) -> np.ndarray | None:
-        """True planar z float32 [H // factor, W // factor], 0 where unknown, or None; see `shrink_depth`."""
         depth = self.recording.depth(camera, frame)
         return None if depth is None else shrink_depth(depth, self.factor)
 
     def mono(self, camera: str, frame: int) -> np.ndarray | None:
-        """The monocular map at the size it is stored in, or None."""
         return self.recording.mono(camera, frame)
 
     def mask(self, camera: str, frame: int) -> np.ndarray | None:
-        """The mean of each block of the mask, float32 [H // factor, W // factor], or None."""
         mask = self.recording.mask(camera, frame)
         return None if mask is None else shrink_mask(mask, self.factor)
 
     def recorded(self, camera: str) -> np.ndarray | None:
-        """Which blocks were recorded whole, bool [H // factor, W // factor], or None where all were."""
         valid = self.recording.recorded(camera)
         return None if valid is None else shrink_mask(valid.astype(np.float32), self.factor) > 1 - 1e-6
 

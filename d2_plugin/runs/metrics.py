@@ -49,11 +49,12 @@ def psnr(image: Tensor, truth: Tensor, within: np.ndarray | None = None) -> floa
 
 
 def psnr_color_corrected(image: Tensor, truth: Tensor) -> float:
-    """PSNR after the best affine change of each channel: exposure and white balance are no error of the model.
+    """PSNR after an affine change of each channel: exposure and white balance are no error of the model.
 
     The least squares fit is a truth + b = image, undone on the image and clamped to 0..1, as gsplat's evaluation does
     (`color_correct_affine`; multinerf's older one is quadratic and mixes channels). Fitted this way round a blurred
-    image is not made paler, which would flatter it. A channel in which nothing agrees keeps its contrast.
+    image is not made paler, which would flatter it. A channel in which nothing agrees keeps its contrast, and one that
+    the change takes farther from the truth stays as it is, so the figure is never below `psnr`.
     """
     render, target = _pair(image, truth)
     corrected = np.stack([_corrected(*channels) for channels in zip(render, target, strict=True)], -1)
@@ -64,7 +65,8 @@ def _corrected(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
     deviation = truth - truth.mean()
     slope = float((deviation * image).sum()) / max(float(np.square(deviation).sum()), 1e-12)
     slope = slope if slope > LEAST_SLOPE else 1.0
-    return np.clip((image - image.mean()) / slope + truth.mean(), 0, 1)
+    corrected = np.clip((image - image.mean()) / slope + truth.mean(), 0, 1)
+    return min(corrected, image, key=lambda one: float(np.square(one - truth).sum()))
 
 
 def ssim_range1(image: Tensor, truth: Tensor) -> float:
@@ -246,7 +248,7 @@ METRICS = {
         lambda c: min(psnr(c.image, c.truth), NO_DIFFERENCE),
     ),
     "psnr_cc": Metric(
-        "PSNR after the best affine change of each channel, a truth + b = image undone (gsplat color_correct_affine)",
+        "PSNR with a truth + b = image undone in each channel where that helps (gsplat color_correct_affine)",
         lambda c: min(psnr_color_corrected(c.image, c.truth), NO_DIFFERENCE),
     ),
     "psnr_moving": Metric(

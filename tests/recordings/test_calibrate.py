@@ -12,11 +12,11 @@ from rigs import NOISE, arc, moved, seen_by, worst
 from d2_plugin.errors import D2Error
 from d2_plugin.recordings.cameras.calibrating.bundle import project
 from d2_plugin.recordings.cameras.calibrating.features import find_features
-from d2_plugin.recordings.cameras.calibrating.refine import RefinedPoses, refine_poses
+from d2_plugin.recordings.cameras.calibrating.refine import RefinedPoses, refine_poses, turns_in_words
 from d2_plugin.recordings.cameras.calibrating.rig import aligned
 from d2_plugin.recordings.cameras.calibrating.solve import solve_features
 from d2_plugin.recordings.cameras.camera import rig_width, rigid
-from d2_plugin.recordings.cameras.epipolar import sampson
+from d2_plugin.recordings.cameras.epipolar import degrees_between, sampson
 
 pytest.importorskip("pycolmap", reason="pycolmap is in the `calibration` extra")
 cv2 = pytest.importorskip("cv2", reason="opencv is in the `calibration` extra")
@@ -40,12 +40,23 @@ class TestRefinedPoses:
         centres = [np.mean([camera.centre for camera in rig.values()], axis=0) for rig in (refined.cameras, given)]
         np.testing.assert_allclose(*centres, atol=1e-9)  # the rig as a whole stays where it was
 
+    @pytest.mark.parametrize("degrees", [0.25, 0.5, 1.0, 2.0])
+    def test_one_camera_that_is_turned_is_named_and_mended(self, degrees: float) -> None:
+        truth = arc()
+        given = {**truth, "c2": moved(truth, degrees, 0.0)["c2"]}
+        refined = refine_poses(given, seen_by(truth))
+        assert [name for name, turn in refined.turns.items() if turn.wrong] == ["c2"]
+        assert refined.turns["c2"].degrees == pytest.approx(degrees, abs=0.1)
+        assert "camera c2 is turned by" in turns_in_words(refined.turns, truth)[0]
+        assert max(degrees_between(refined.cameras[name], truth[name]) for name in truth) < 0.1
+
     def test_right_poses_stay(self) -> None:
         truth = arc()
         refined = refine_poses(truth, seen_by(truth))
         assert not refined.accepted
         assert refined.cameras == truth
         assert "the poses stay" in refined.reason
+        assert not any(turn.wrong for turn in refined.turns.values())
 
     def test_matches_that_are_all_wrong_change_nothing(self) -> None:
         truth = arc(2)
@@ -139,7 +150,7 @@ def test_sampsons_distance_is_zero_for_what_both_see_and_grows_by_the_pixel() ->
     cameras = arc(2)
     points = np.random.default_rng(0).uniform(-1, 1, (50, 3))
     p, q = (project(camera, points) for camera in cameras.values())
-    assert sampson(cameras["c0"], cameras["c1"], p, q).max() < 1e-9
+    assert np.abs(sampson(cameras["c0"], cameras["c1"], p, q)).max() < 1e-9
     off = sampson(cameras["c0"], cameras["c1"], p, q + [0, 2.0])  # across the lines, shared by the two
     assert 0.9 < np.median(off) < 1.6
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 
 from d2_plugin.errors import D2Error
 from d2_plugin.recordings import Recording, Source, open_recording, select_cameras
+from d2_plugin.recordings.cameras import check
 from d2_plugin.recordings.cameras.camera import checked_camera
 from d2_plugin.recordings.cameras.check import check_recording
 from d2_plugin.recordings.checks import memory as memory_module
@@ -65,6 +67,20 @@ def test_a_wrong_focal_length_is_named(room: Recording) -> None:
     K = room.cameras[names[0]].K.copy()
     K[:2, 2] += 40  # a crop that nobody told the calibration
     assert any("misses features" in note for note in notes_of(moved(room, names[0], K=K)))
+
+
+def test_one_bad_pair_does_not_overrule_all_others() -> None:
+    def said(*missed: str) -> tuple[bool, str]:
+        pairs = [(a, b) for a, b in combinations("abcd", 2)]
+        checked = [check._Pair(a, b, 151.0 if a + b in missed else 1.0, a + b in missed, 40) for a, b in pairs]
+        return check._outweighed(checked), check._missed(checked)
+
+    wrong, why = said("ad")
+    assert not wrong
+    assert "features of a and d by 151 pixels, but not those of their other pairs" in why
+    wrong, why = said("ad", "bd", "cd")
+    assert wrong
+    assert why.endswith("check R, t and K of camera d")
 
 
 def test_a_camera_that_looks_away_is_named(room: Recording) -> None:

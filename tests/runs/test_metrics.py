@@ -149,6 +149,8 @@ def test_colour_correction_neither_flatters_a_blurred_render_nor_invents_contras
     flat = torch.full_like(image, 0.3)
     mean = image.mean((0, 1)).expand_as(image)
     assert metrics.psnr_color_corrected(flat, image) == pytest.approx(metrics.psnr(mean, image))
+    faint = 0.5 + 0.12 * (image - 0.5) + noise  # undoing its slope makes its noise eight times as large
+    assert metrics.psnr_color_corrected(faint, image) >= metrics.psnr(faint, image)
 
 
 def test_psnr_within_a_mask_counts_those_pixels_alone(image: torch.Tensor) -> None:

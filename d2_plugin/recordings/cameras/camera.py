@@ -15,8 +15,7 @@ from d2_plugin.values import checked_arguments, shown
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 """From OpenGL's camera axes (y up, z backward) to OpenCV's (y down, z forward), and back."""
 
-ROTATION_TOLERANCE = 1e-3
-"""Largest entry of R R^T - I that still counts as rounding in a text file."""
+ROTATION_TOLERANCE = 1e-3  # largest entry of R R^T - I that still counts as rounding in a text file
 
 ASPECT_TOLERANCE = 0.01
 """Relative difference of horizontal and vertical scale that still counts as rounding of a size to whole pixels."""
@@ -27,8 +26,7 @@ LARGEST_NUMBER = 1e9
 OPENCV_CENTRE = 0.5
 """What is added to principal points of formats whose first pixel has its centre at 0, as OpenCV's has."""
 
-LARGEST_SIDE = 65_535
-"""Most pixels along a side, as JPEG has it."""
+LARGEST_SIDE = 65_535  # most pixels along a side, as JPEG has it
 
 FIELD_OF_VIEW = (0.5, 178.0)
 """A camera that sees less or more than this, in degrees, is refused. What is unusual is noted, see `check`."""
@@ -36,14 +34,9 @@ FIELD_OF_VIEW = (0.5, 178.0)
 MOST_OBLIQUE = 80.0
 """Degrees between a camera's axis and the middle of its image, at most: what is farther out is no principal point."""
 
-FOCAL_RATIO = 4.0
-"""fx and fy differ by less than this factor: anamorphic lenses reach 2."""
-
-FRAME_RATES = (1e-6, 1e6)
-"""Frames per second: from one in eleven days to a million."""
-
-LONGEST_NAME = 100
-"""Letters of a camera's name, which becomes a folder and part of file names."""
+FOCAL_RATIO = 4.0  # fx and fy differ by less than this factor: anamorphic lenses reach 2
+FRAME_RATES = (1e-6, 1e6)  # frames per second: from one in eleven days to a million
+LONGEST_NAME = 100  # letters of a camera's name, which becomes a folder and part of file names
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,13 +48,10 @@ class CalibratedCamera:
 
     name: str
     width: int
-    height: int
-    """Pixels of the images; both 0 where a file names no size."""
+    height: int  # pixels of the images; both 0 where a file names no size
     lens: Lens
-    T_camera_world: np.ndarray
-    """[4, 4] float64, world to camera, in the unit of the file."""
-    near_far: tuple[float, float] | None = None
-    """Depth range that the file declares, world units."""
+    T_camera_world: np.ndarray  # [4, 4] float64, world to camera, in the unit of the file
+    near_far: tuple[float, float] | None = None  # depth range that the file declares, world units
 
     @property
     def size(self) -> tuple[int, int]:

@@ -22,44 +22,25 @@ from d2_plugin.recordings.images import opencv
 from d2_plugin.recordings.recording import Camera, Recording
 from d2_plugin.recordings.selection import spread
 
-USUAL_VIEW = (5.0, 170.0)
-"""Degrees across or down that a camera usually sees."""
-
-FAR_FROM_ORIGIN = 1e4
-"""A rig this many times as far from the origin as it is wide loses digits in float32."""
+USUAL_VIEW = (5.0, 170.0)  # degrees across or down that a camera usually sees
+FAR_FROM_ORIGIN = 1e4  # A rig this many times as far from the origin as it is wide loses digits in float32
 
 DEPTHS = np.geomspace(0.05, 1000, 25)
 """Where cameras without declared bounds may see the same thing, in widths of the rig."""
 
-GRID = 12
-"""Pixels across and down that stand for an image."""
-
-ONE_COLOUR = 2
-"""An image whose channels vary by no more levels of 255 than this shows nothing."""
-
-SPARSE = 8
-"""Where every eighth pixel each way varies, the others need not be asked."""
+GRID = 12  # pixels across and down that stand for an image
+ONE_COLOUR = 2  # an image whose channels vary by no more levels of 255 than this shows nothing
+SPARSE = 8  # where every eighth pixel each way varies, the others need not be asked
 
 LOOKED_AT = 1 << 25
 """Pixels that are read, at most: all images of a small recording, some of each camera of a large one."""
 
-LONG_SIDE = 640
-"""Features are looked for in images of at most this many pixels along the longer side."""
-
-MOST_PAIRS = 12
-"""Pairs of cameras whose features are matched, at most."""
-
-ENOUGH = 12
-"""Matched features on one geometry, any, below which two images say nothing about their calibration."""
-
-ENOUGH_SHARE = 0.5
-"""Share of the matched features that must lie on one geometry: false matches do not."""
-
-MOST_SWAPPED = 6
-"""Cameras of a recording in which two that were swapped are looked for."""
-
-MISSED = 0.01
-"""Median distance from the epipolar lines, in diagonals of the image, beyond which a calibration is named."""
+LONG_SIDE = 640  # features are looked for in images of at most this many pixels along the longer side
+MOST_PAIRS = 12  # pairs of cameras whose features are matched, at most
+ENOUGH = 12  # matched features on one geometry, any, below which two images say nothing about their calibration
+ENOUGH_SHARE = 0.5  # share of the matched features that must lie on one geometry: false matches do not
+MOST_SWAPPED = 6  # cameras of a recording in which two that were swapped are looked for
+MISSED = 0.01  # median distance from the epipolar lines, in diagonals of the image, beyond which a calibration is named
 
 
 class _Pair(NamedTuple):
@@ -69,6 +50,7 @@ class _Pair(NamedTuple):
     other: str
     distance: float
     missed: bool
+    matches: int
 
 
 def check_recording(recording: Recording, cameras: Sequence[str], scored: Sequence[str] = ()) -> tuple[str, ...]:
@@ -181,7 +163,7 @@ def _empty_masks(recording: Recording, cameras: Sequence[str], frames: Sequence[
         if recorded is not None and not recorded.any():
             raise D2Error(
                 f"nothing of camera {name} was recorded, as its mask in valid/ and its lens say: correct that mask, or "
-                "leave the camera out"
+                f"leave camera {name} out"
             )
         masks = {frame: recording.mask(name, frame) for frame in frames}
         empty = [frame for frame, mask in masks.items() if mask is not None and not mask.any()]
@@ -195,11 +177,25 @@ def _range(image: np.ndarray) -> np.ndarray:
     return colours.max(axis=0).astype(int) - colours.min(axis=0)
 
 
-def calibration_contradicted(recording: Recording) -> str:
-    """What `check_recording` says of a calibration that contradicts the images, and whose swap would mend it; or ""."""
-    said = next(iter(_contradicted(recording, list(recording.cameras))), "")
-    swap = _swapped(recording) if said else None
-    return f"cameras {swap[0]} and {swap[1]} are swapped: exchange their videos or their entries" if swap else said
+def calibration_contradicted(recording: Recording) -> tuple[bool, str]:
+    """(whether the calibration must be wrong, what `check_recording` says of it or whose swap would mend it; or "")."""
+    names = list(recording.cameras)
+    checked = _checked(recording, names, {name: _features(recording, name) for name in names})
+    said, wrong = _missed(checked), _outweighed(checked)
+    swap = _swapped(recording) if wrong else None
+    return (
+        wrong,
+        f"cameras {swap[0]} and {swap[1]} are swapped: exchange their videos or their entries" if swap else said,
+    )
+
+
+def _outweighed(checked: Sequence[_Pair]) -> bool:
+    """Whether more matches of some camera speak against the calibration than for it: one bad pair of many does not."""
+    for name in {name for pair in checked for name in pair[:2]}:
+        votes = [pair.matches * (1 if pair.missed else -1) for pair in checked if name in pair[:2]]
+        if sum(votes) > 0:
+            return True
+    return False
 
 
 def _swapped(recording: Recording) -> tuple[str, str] | None:
@@ -222,14 +218,24 @@ def _contradicted(recording: Recording, cameras: Sequence[str]) -> Iterator[str]
     """Pairs whose calibration misses the features that their images share."""
     if len(cameras) < 2:
         return
-    checked = _checked(recording, cameras, {name: _features(recording, name) for name in cameras})
+    said = _missed(_checked(recording, cameras, {name: _features(recording, name) for name in cameras}))
+    if said:
+        yield said
+
+
+def _missed(checked: Sequence[_Pair]) -> str:
     wrong = [pair for pair in checked if pair.missed]
-    if not wrong:
-        return
-    suspects = _suspects(checked)
     listed = ", ".join(f"{pair.one} and {pair.other} by {pair.distance:.0f} pixels" for pair in wrong[:4])
+    if not wrong:
+        return ""
+    if not _outweighed(checked):
+        return (
+            f"the calibration misses features of {listed}, but not those of their other pairs, which are more: most "
+            "likely a pattern that repeats, so it stands"
+        )
+    suspects = _suspects(checked)
     whose = f"camera {' and '.join(suspects)}" if suspects else "these cameras"
-    yield (
+    return (
         f"the calibration misses features that two images share, {listed}{', ...' if len(wrong) > 4 else ''} "
         f"(median; good calibrations miss by one): check R, t and K of {whose}"
     )
@@ -291,4 +297,4 @@ def _pair(recording: Recording, one: str, other: str, features: Mapping[str, _Fe
         return None
     off = np.abs((epipolar_lines(a, b, p[inside]) * homogeneous(q[inside])).sum(axis=1))
     distance = float(np.median(off))
-    return _Pair(one, other, distance, distance > max(MISSED * diagonal, 4.0))
+    return _Pair(one, other, distance, distance > max(MISSED * diagonal, 4.0), int(inside.sum()))

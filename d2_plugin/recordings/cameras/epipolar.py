@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import replace
+
 import numpy as np
 
+from d2_plugin.recordings.cameras.rotations import rotation_of_vector
 from d2_plugin.recordings.images import checked_image, opencv
 from d2_plugin.recordings.recording import Camera
 
-OPENCVS_CONTRAST = 0.04
-"""Of a SIFT feature, at least."""
+OPENCVS_CONTRAST = 0.04  # of a SIFT feature, at least
+
+
+SCALES = (16.0, 8.0, 4.0, 2.0, 1.0, 1.0, 0.5, 0.5)  # pixels beyond which a match hardly counts, round by round
+LARGEST_TURN = 0.05  # radians of one step
 
 
 def sift_features(
@@ -55,9 +62,50 @@ def epipolar_lines(one: Camera, other: Camera, pixels: np.ndarray) -> np.ndarray
 
 
 def sampson(one: Camera, other: Camera, p: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Distance [n] in pixels, to first order, of pairs [n, 2] from the nearest that `one` and `other` allow."""
+    """Distance [n] in pixels, to first order and signed, of pairs [n, 2] from the nearest that two cameras allow."""
     F = fundamental(one, other)
     there, back = homogeneous(p) @ F.T, homogeneous(q) @ F
     squares = (there[:, :2] ** 2).sum(axis=1) + (back[:, :2] ** 2).sum(axis=1)
-    distance: np.ndarray = np.abs((homogeneous(q) * there).sum(axis=1)) / np.sqrt(squares).clip(1e-300)
+    distance: np.ndarray = (homogeneous(q) * there).sum(axis=1) / np.sqrt(squares).clip(1e-300)
     return distance
+
+
+Matched = Mapping[tuple[str, str], tuple[np.ndarray, np.ndarray]]  # two cameras -> pixels [m, 2] of the same things
+
+
+def turned(name: str, cameras: Mapping[str, Camera], matched: Matched) -> Camera:
+    """One camera, turned where it stands so that its matches with the others miss the epipolar lines the least.
+
+    Positions of a calibration are rarely wrong, and with them held three angles are settled by few features.
+    Gauss-Newton with Cauchy's loss, whose scale falls to `SCALES[-1]` pixels.
+    """
+    own = {pair: pixels for pair, pixels in matched.items() if name in pair}
+    camera, step = cameras[name], 1e-5
+    if not own:
+        return camera
+
+    def misses(angles: np.ndarray) -> np.ndarray:
+        trial = {**cameras, name: rotated(camera, angles)}
+        return np.concatenate([sampson(trial[a], trial[b], p, q) for (a, b), (p, q) in own.items()])
+
+    for scale in SCALES:
+        here = misses(np.zeros(3))
+        slopes = np.stack([(misses(step * axis) - here) / step for axis in np.eye(3)], axis=1)
+        weighted = slopes / (1 + (here / scale) ** 2)[:, None]
+        angles = -np.linalg.lstsq(weighted.T @ slopes, weighted.T @ here, rcond=1e-9)[0]
+        camera = rotated(camera, np.clip(angles, -LARGEST_TURN, LARGEST_TURN))
+    return camera
+
+
+def rotated(camera: Camera, angles: np.ndarray) -> Camera:
+    """The camera turned where it stands, about its own axes, by angles [3] in radians."""
+    turn = np.eye(4)
+    turn[:3, :3] = rotation_of_vector(angles)
+    return replace(camera, T_camera_world=turn @ camera.T_camera_world)
+
+
+def degrees_between(one: Camera, other: Camera) -> float:
+    """Degrees between two orientations."""
+    turn = one.T_camera_world[:3, :3] @ other.T_camera_world[:3, :3].T
+    sine = np.linalg.norm(turn - turn.T) / (2 * np.sqrt(2))  # accurate at small angles, as a cosine is not
+    return float(np.rad2deg(np.arctan2(sine, (np.trace(turn) - 1) / 2)))

@@ -25,11 +25,8 @@ Model = Literal["pinhole", "opencv", "fisheye"]
 MODELS: tuple[str, ...] = get_args(Model)
 """No distortion; OpenCV's k1 k2 p1 p2 k3 k4 k5 k6 (trailing zeros may be left out); OpenCV's fisheye k1 k2 k3 k4."""
 
-LARGEST_COEFFICIENT = 1e4
-"""Distortion coefficients beyond this are a damaged file: those of real lenses are below 100."""
-
-NEVER = 1e-12
-"""A fold is ignored where 1 / a^2 is below this: it lies a million focal lengths away from the centre."""
+LARGEST_COEFFICIENT = 1e4  # distortion coefficients beyond this are a damaged file: those of real lenses are below 100
+NEVER = 1e-12  # A fold is ignored where 1 / a^2 is below this: it lies a million focal lengths away from the centre
 
 
 @dataclass(frozen=True, eq=False)

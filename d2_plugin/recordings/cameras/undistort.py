@@ -18,14 +18,9 @@ from d2_plugin.recordings.images import opencv
 from d2_plugin.recordings.recording import Camera, Source
 from d2_plugin.values import checked_arguments
 
-KEPT_MAPS = 8
-"""Cameras whose resampling map stays in memory (6 bytes per pixel each)."""
-
-COVERAGE_STEP = 8
-"""Grid step in pixels, across and down, for measuring how much of an image is black."""
-
-MOST_BLACK = 0.5
-"""Share of an undistorted image that may be without a recorded pixel: more is a wrong coefficient."""
+KEPT_MAPS = 8  # cameras whose resampling map stays in memory (6 bytes per pixel each)
+COVERAGE_STEP = 8  # grid step in pixels, across and down, for measuring how much of an image is black
+MOST_BLACK = 0.5  # share of an undistorted image that may be without a recorded pixel: more is a wrong coefficient
 
 
 class Undistortion:
@@ -80,29 +75,23 @@ class UndistortedSource(Source):
     """The images of `source` as pinhole cameras would have taken them; maps on disk fit these already."""
 
     source: Source
-    cameras: Mapping[str, CalibratedCamera]
-    """Those whose images are undistorted."""
+    cameras: Mapping[str, CalibratedCamera]  # those whose images are undistorted
     _kept: dict[str, Undistortion] = field(default_factory=dict, repr=False)
 
     def image(self, camera: str, frame: int) -> np.ndarray:
-        """RGB uint8 [H, W, 3], black where nothing was recorded."""
         return self._undone(camera, self.source.image(camera, frame))
 
     def depth(self, camera: str, frame: int) -> np.ndarray | None:
-        """True planar z of the undistorted image as it lies on disk, or None."""
         return self.source.depth(camera, frame)
 
     def mono(self, camera: str, frame: int) -> np.ndarray | None:
-        """A monocular map of the undistorted image as it lies on disk, or None."""
         return self.source.mono(camera, frame)
 
     def mask(self, camera: str, frame: int) -> np.ndarray | None:
-        """The mask of the recorded image, undistorted with it, or None."""
         mask = self.source.mask(camera, frame)
         return None if mask is None else self._undone(camera, mask)
 
     def recorded(self, camera: str) -> np.ndarray | None:
-        """Which pixels [H, W] of the undistorted image were recorded, or None where all were."""
         valid = self.source.recorded(camera)
         if camera not in self.cameras:
             return valid

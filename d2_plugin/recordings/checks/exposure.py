@@ -9,10 +9,8 @@ import numpy as np
 
 from d2_plugin.recordings.recording import Camera, Recording
 
-DARK, BRIGHT = 10, 245
-"""Values of a pixel, of 255, beyond which a channel says nothing about gain: noise, or clipped."""
-FEWEST = 20
-"""Points that a camera must share with others."""
+DARK, BRIGHT = 10, 245  # values of a pixel, of 255, beyond which a channel says nothing about gain: noise, or clipped
+FEWEST = 20  # points that a camera must share with others
 
 
 class Exposures(NamedTuple):

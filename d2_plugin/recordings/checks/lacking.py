@@ -15,18 +15,14 @@ from d2_plugin.recordings.recording import Camera, Recording
 FAR_APART = 35.0
 """Degrees between a camera and its nearest neighbour from which stereo verifies little: see docs/your-recording.md."""
 
-SHORT_SIDE = 180
-"""Images with a shorter side have little to match."""
-
-UNEQUAL, UNEQUAL_TIME = 0.02, 0.25
-"""Gain off the mean, and lateness in frames, that are noted."""
+SHORT_SIDE = 180  # images with a shorter side have little to match
+UNEQUAL, UNEQUAL_TIME = 0.02, 0.25  # gain off the mean, and lateness in frames, that are noted
 
 
 class Finding(NamedTuple):
     """One line."""
 
-    verdict: str
-    """`has`, `lacks` or `check`."""
+    verdict: str  # `has`, `lacks` or `check`
     what: str
     text: str
 
@@ -70,7 +66,7 @@ def _cameras(rig: Sequence[Camera]) -> Iterator[Finding]:
 def _images(recording: Recording) -> Iterator[Finding]:
     sizes = sorted({(camera.width, camera.height) for camera in recording.cameras.values()})
     shown = ", ".join(f"{width}x{height}" for width, height in sizes)
-    yield Finding("has", "images", f"{len(recording.frames)} frames at {recording.fps:g} per second, {shown} pixels")
+    yield Finding("has", "images", f"{len(recording.frames)} frames at {recording.rate:g} per second, {shown} pixels")
     if min(min(size) for size in sizes) < SHORT_SIDE:
         yield Finding("lacks", "resolution", f"a side below {SHORT_SIDE} pixels: import with a larger --scale")
     if len(recording.frames) < 2:

@@ -11,14 +11,9 @@ from pathlib import Path
 from d2_plugin.errors import D2Error
 from d2_plugin.recordings.recording import Recording
 
-BYTES_PER_PIXEL = 110
-"""Of every training camera, at the peak of building its prior or of rendering it."""
-
-BASE_BYTES = 1 << 29
-"""What Python, torch and the Gaussians take whatever the size of the images."""
-
-SCALES = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64)
-"""What is proposed for `--downscale`."""
+BYTES_PER_PIXEL = 110  # of every training camera, at the peak of building its prior or of rendering it
+BASE_BYTES = 1 << 29  # what Python, torch and the Gaussians take whatever the size of the images
+SCALES = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64)  # what is proposed for `--downscale`
 
 
 def needed_bytes(recording: Recording, cameras: Sequence[str], downscale: int = 1) -> int:

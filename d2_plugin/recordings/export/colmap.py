@@ -16,14 +16,9 @@ from d2_plugin.recordings.export.ply import PointCloud, color_bytes, write_point
 from d2_plugin.recordings.images import encode_jpeg
 from d2_plugin.recordings.recording import Camera
 
-PINHOLE = 1
-"""COLMAP's number of the camera model with fx, fy, cx, cy."""
-
-JPEG_QUALITY = 98
-"""Of the images that 4DGaussians insists to be JPEG."""
-
-LEAST_POINTS = 100
-"""Fewer points of its own than this, and an instant starts from those of all instants."""
+PINHOLE = 1  # COLMAP's number of the camera model with fx, fy, cx, cy
+JPEG_QUALITY = 98  # of the images that 4DGaussians insists to be JPEG
+LEAST_POINTS = 100  # fewer points of its own than this, and an instant starts from those of all instants
 
 
 class Image(NamedTuple):

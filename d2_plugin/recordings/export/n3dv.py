@@ -19,8 +19,7 @@ from d2_plugin.recordings.recording import Camera
 
 log = logging.getLogger(__name__)
 
-READ_FRAMES = 24
-"""Frames of each camera that Deformable-3D-Gaussians reads (scene/__init__.py), however many there are."""
+READ_FRAMES = 24  # frames of each camera that Deformable-3D-Gaussians reads (scene/__init__.py), however many there are
 
 
 def write_n3dv(export: Export) -> Written:

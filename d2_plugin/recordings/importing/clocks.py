@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from typing import NamedTuple
@@ -23,18 +23,19 @@ METHODS = ("auto", "timecode", "sound", "motion", "none")
 APART = 0.75
 """Frames by which evidence may differ from the whole, beside three times its error: more is a contradiction."""
 
-TIMECODE_ERROR = 12**-0.5
-"""Frames: the standard deviation of what is rounded to whole frames."""
+STAMPS = "the files' own stamps"  # how a method begins that takes them
+STAMPS_ERROR = 0.5  # frames: the same of stamps that nothing confirms
+
+TIMECODE_ERROR = 12**-0.5  # frames: the standard deviation of what is rounded to whole frames
 
 SOUND_ERROR = 1e-3
 """Seconds at least that an offset from sound may be wrong: sound travels a third of a metre in that time."""
 
-DAY = 86_400
-"""Seconds after which a timecode begins anew, so that the shorter way around midnight counts."""
+DAY = 86_400  # seconds after which a timecode begins anew, so that the shorter way around midnight counts
 
 _TIMECODE = re.compile(r"(\d{1,2}):(\d{2}):(\d{2})([:;.])(\d{2,3})$")
 
-INSTEAD = "leave the camera out, give the offsets (--offsets NAME=FRAMES,...), or record a clap that all see and hear"
+INSTEAD = "give the offsets (--offsets NAME=FRAMES,...), or record a clap that all see and hear"
 
 
 @dataclass(frozen=True)
@@ -42,10 +43,8 @@ class Clock:
     """When the clock of a video began, after that of the first camera."""
 
     seconds: float
-    error: float
-    """Standard error, seconds; 0 for what was given."""
-    method: str
-    """Where it comes from, such as `sound`."""
+    error: float  # standard error, seconds; 0 for what was given
+    method: str  # where it comes from, such as `sound`
 
 
 class Evidence(NamedTuple):
@@ -59,11 +58,13 @@ class Evidence(NamedTuple):
 
 
 def common_clock(
-    videos: Mapping[str, VideoFile], how: str, watching: Callable[[], Mapping[str, Watched]]
+    videos: Mapping[str, VideoFile], how: str, watching: Callable[[], Mapping[str, Watched]] | None
 ) -> dict[str, Clock]:
     """When each video's clock began, by the best evidence there is: timecode, then sound, then motion.
 
-    `watching` gives small images of all cameras; all videos are decoded for it, so only where motion must decide.
+    Where nothing says it and all files are alike, their own stamps are taken, and `method` says so.
+    `watching` gives small images of all cameras; all videos are decoded for it, so only where motion must decide. With
+    None, as motion takes the calibration that may be looked for, nothing comes back there.
 
     Raises:
         D2Error: no evidence links a camera to the others, or the evidence contradicts itself.
@@ -76,12 +77,20 @@ def common_clock(
     if how in ("auto", "sound"):
         evidence += _of_sound({name: read_sound(video.path) for name, video in videos.items() if video.sound})
     if how == "motion" or (how == "auto" and len(linked_names(names, [one[:2] for one in evidence])) < len(names)):
-        evidence += _of_motion(watching(), names, videos)
+        if watching is None:
+            return {}
+        by_motion, doubt = _of_motion(watching(), names, videos)
+        if doubt and (evidence or how == "motion" or not _of_one_recorder(videos.values())):
+            raise D2Error(f"{doubt}: {INSTEAD}")
+        if doubt:
+            method = f"{STAMPS}, as if one program had recorded them all ({doubt})"
+            return {name: Clock(0.0, STAMPS_ERROR * frame, method) for name in names}
+        evidence += by_motion
     linked = linked_names(names, [one[:2] for one in evidence])
     if len(linked) < len(names):
         alone = ", ".join(name for name in names if name not in linked)
         what = {"auto": "timecode, sound or motion"}.get(how, f"the {how}")
-        raise D2Error(f"nothing in {what} links {alone} with {', '.join(linked)}: {INSTEAD}")
+        raise D2Error(f"nothing in {what} links {alone} with {', '.join(linked)}: leave camera {alone} out, {INSTEAD}")
     return _solved(names, evidence, frame)
 
 
@@ -137,17 +146,24 @@ def _of_sound(sounds: Mapping[str, Sound | None]) -> list[Evidence]:
     return evidence
 
 
-def _of_motion(watched: Mapping[str, Watched], names: Sequence[str], videos: Mapping[str, VideoFile]) -> list[Evidence]:
+def _of_motion(
+    watched: Mapping[str, Watched], names: Sequence[str], videos: Mapping[str, VideoFile]
+) -> tuple[list[Evidence], str]:
+    """(what motion says, or nothing and why it says nothing)."""
     seen = offsets_from_motion(watched, search=max(float(np.ptp(video.times)) for video in videos.values()))
     doubtful = {name: one.doubt for name, one in seen.items() if one.doubt}
     if doubtful:
         name, why = next(iter(doubtful.items()))
         whose = f"camera {name}" if len(names) - len(doubtful) > 1 else "the cameras"
-        raise D2Error(f"motion does not say when {whose} started ({why}): {INSTEAD}")
-    return [
-        Evidence(names[0], name, seen[name].seconds - seen[names[0]].seconds, seen[name].error, "motion")
-        for name in names[1:]
-    ]
+        return [], f"motion does not say when {whose} started ({why})"
+    first = seen[names[0]].seconds
+    return [Evidence(names[0], name, seen[name].seconds - first, seen[name].error, "motion") for name in names[1:]], ""
+
+
+def _of_one_recorder(videos: Collection[VideoFile]) -> bool:
+    """Whether videos are as long and as fast as those that one program writes of several cameras."""
+    lengths, rates = [len(video.stamps) for video in videos], [video.rate for video in videos]
+    return max(lengths) - min(lengths) <= 1 and max(rates) <= 1.001 * min(rates)
 
 
 def linked_names(names: Sequence[str], pairs: Iterable[tuple[str, str]]) -> list[str]:
@@ -204,5 +220,6 @@ def _contradiction(names: Sequence[str], evidence: Sequence[Evidence], frame: fl
     )
     between = f"by {off / frame:.1f} frames between {one.one} and {one.other}"
     if len(guilty) == 1:
-        return f"{said} {between}, and without camera {guilty[0]} all agree (is it of another event?): {INSTEAD}"
+        without = f"without camera {guilty[0]} all agree (is it of another event?)"
+        return f"{said} {between}, and {without}: leave camera {guilty[0]} out, {INSTEAD}"
     return f"{said} {between}: choose one with --offsets timecode, sound or motion, or give them, NAME=FRAMES,..."

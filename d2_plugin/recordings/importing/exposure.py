@@ -17,26 +17,16 @@ from d2_plugin.recordings.importing.clocks import linked_names
 from d2_plugin.recordings.recording import Camera, Exposure, Recording
 from d2_plugin.recordings.selection import spread
 
-FRAMES = 6
-"""Instants at which features are looked for."""
-
-FEATURES = 3000
-"""Of an image, at most."""
-
-DIAGONAL = 1 / 800
-"""Of the image: how far a feature may lie from where its triangulated point falls."""
-
-DISTINCT = 0.8
-"""A match is kept where the second best is this much farther away (Lowe 2004)."""
+FRAMES = 6  # instants at which features are looked for
+FEATURES = 3000  # of an image, at most
+DIAGONAL = 1 / 800  # of the image: how far a feature may lie from where its triangulated point falls
+DISTINCT = 0.8  # A match is kept where the second best is this much farther away (Lowe 2004)
 
 LIKELY = 380.0
 """A match whose descriptor differs by more than `DISTINCT` times this is none: SIFT's have the length 512."""
 
-FEWEST = 20
-"""Matches of two cameras, over all instants, that a gain takes."""
-
-DARK, BRIGHT = 10, 245
-"""Values of a pixel, of 255, beyond which a channel says nothing about gain: noise, or clipped."""
+FEWEST = 20  # matches of two cameras, over all instants, that a gain takes
+DARK, BRIGHT = 10, 245  # values of a pixel, of 255, beyond which a channel says nothing about gain: noise, or clipped
 
 
 def measured_exposures(recording: Recording, cameras: Sequence[str]) -> dict[str, Exposure]:

@@ -18,20 +18,16 @@ from d2_plugin.recordings.importing.video import VideoFile, usual_rate
 REACH = 0.75
 """An image farther than this many frames of the recording, or half of the camera's own, stands for no instant."""
 
-TOGETHER = 1e-4
-"""Seconds: cameras that are late by no more exposed together."""
+TOGETHER = 1e-4  # seconds: cameras that are late by no more exposed together
 
 
 @dataclass(frozen=True)
 class Grid:
     """Which frame of which video is which frame of the recording."""
 
-    rate: float
-    """Frames of the recording per second."""
-    indices: dict[str, dict[int, int]]
-    """By camera: frame of the recording -> frame of the video."""
-    late: dict[str, dict[int, float]]
-    """By camera and frame, seconds; empty where all exposed together."""
+    rate: float  # frames of the recording per second
+    indices: dict[str, dict[int, int]]  # by camera: frame of the recording -> frame of the video
+    late: dict[str, dict[int, float]]  # by camera and frame, seconds; empty where all exposed together
     notes: tuple[str, ...] = ()
 
 

@@ -15,41 +15,44 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, replace
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from d2_plugin.durable import make_folder, remove_leftovers, write, write_table, write_text
-from d2_plugin.errors import D2Error
+from d2_plugin.errors import D2Error, MissingExtra
 from d2_plugin.locks import only_writer
 from d2_plugin.progress import progress_bar
 from d2_plugin.reading import json_text
-from d2_plugin.recordings.cameras.calibrating.refine import refine
+from d2_plugin.recordings.cameras.calibrating.refine import check_poses, refine, turns_in_words
 from d2_plugin.recordings.cameras.calibration import LARGE_RIG, Calibration, open_calibration
 from d2_plugin.recordings.cameras.camera import CalibratedCamera, rig_width, scaled
 from d2_plugin.recordings.cameras.check import calibration_contradicted
 from d2_plugin.recordings.cameras.formats.cameras_json import read_camera
 from d2_plugin.recordings.export.folder import described
 from d2_plugin.recordings.images import VALID_FOLDER, encode_jpeg, write_mask, write_png
-from d2_plugin.recordings.importing.clocks import METHODS, Clock, common_clock, given_clock
+from d2_plugin.recordings.importing.clocks import METHODS, STAMPS, Clock, common_clock, given_clock
 from d2_plugin.recordings.importing.exposure import measured_exposures
 from d2_plugin.recordings.importing.grid import grid_of
 from d2_plugin.recordings.importing.motion import small_images
 from d2_plugin.recordings.importing.settings import UNITS, ImportSettings, check_calibration
 from d2_plugin.recordings.importing.solved_rig import calibration_table, rig_of_videos, summary
 from d2_plugin.recordings.importing.source import Cut, VideosSource, cuts_of
-from d2_plugin.recordings.importing.steps import STEPS, identity, kept, paths_of, refuse_another
+from d2_plugin.recordings.importing.steady import DRIFT, steadiness
+from d2_plugin.recordings.importing.steps import SOLVED, STEPS, identity, kept, paths_of, refuse_another
 from d2_plugin.recordings.importing.video import VideoFile, read_video
 from d2_plugin.recordings.readers.videos import KIND as VIDEOS
 from d2_plugin.recordings.readers.videos import TABLE
 from d2_plugin.recordings.recording import Exposure, Recording
 from d2_plugin.values import checked_arguments
 
-Report = Callable[[str], None]
-"""Called with a sentence after each step."""
+Report = Callable[[str], None]  # called with a sentence after each step
 
 JPEG_QUALITY = 95
+
+SAME_POSE = 1e-6  # difference of two poses, in widths of the rig, that is rounding
 
 
 @checked_arguments
@@ -80,18 +83,21 @@ def import_videos(settings: ImportSettings, report: Report = lambda line: None) 
         remove_leftovers(folder)
         if solved is not None:
             kept(folder, "rig", lambda: solved)
-            table = json_text(solved, "calibration.json", indent=1, sort_keys=True)  # as the one that is kept has them
-            write_text(folder / "calibration.json", table + "\n")
+            table = json_text(solved, SOLVED, indent=1, sort_keys=True)  # as the one that is kept has them
+            write_text(folder / SOLVED, table + "\n")
         clocks = _clocks(settings, folder, videos, cameras)
         report(_clocks_in_words(clocks, videos))
         grid = grid_of(videos, clocks, settings.rate, settings.times, settings.frames)
         source = VideosSource(videos, grid.indices, cameras, cuts)
-        frames, notes = tuple(grid.indices[next(iter(videos))]), (*notes, *grid.notes)
+        frames, more = tuple(grid.indices[next(iter(videos))]), _notes_of_videos(settings, videos, grid.indices)
+        notes = (*notes, *_notes_of_clocks(clocks), *grid.notes, *more)
         recording = Recording(
             folder.resolve().name, source.pinholes(), frames, grid.rate, source, folder, notes=notes, late=grid.late
         )
         if settings.refine_poses:
             recording = _with_refined_poses(folder, recording, report)
+        elif solved is None and len(cameras) > 1:
+            recording = _with_checked_poses(recording, report)
         if settings.images != "videos":
             _write_images(folder, recording, settings.images, report)
         if settings.exposure and len(recording.cameras) > 1:
@@ -123,9 +129,16 @@ def _known_rig(
         )
     if len(cameras) > 1 and width == 0:
         raise D2Error(f"{calibration} puts all cameras at one place: give a calibration with their poses")
-    wrong = _contradiction(turned, cameras) if len(cameras) > 1 else ""
-    if wrong:
-        raise D2Error(f"{calibration} does not fit the videos: {wrong}")
+    for one, other in combinations(cameras, 2):
+        if np.allclose(one.T_camera_world, other.T_camera_world, atol=SAME_POSE * width):
+            raise D2Error(
+                f"{calibration} gives cameras {one.name} and {other.name} the identical pose: correct one, or leave "
+                "its video out"
+            )
+    wrong, said = _contradiction(turned, cameras) if len(cameras) > 1 else (False, "")
+    if wrong and not settings.accept_calibration:
+        raise D2Error(f"{calibration} does not fit the videos: {said}; or give --accept-calibration true")
+    more = (*more, said) if said else more
     return turned, {camera.name: camera for camera in cameras}, (*notes, *more)
 
 
@@ -143,8 +156,8 @@ def _oriented(path: Path, videos: Mapping[str, VideoFile]) -> tuple[dict[str, Vi
         raise
 
 
-def _contradiction(videos: Mapping[str, VideoFile], cameras: Sequence[CalibratedCamera]) -> str:
-    """What the images in the middle of the videos say against the calibration, or nothing."""
+def _contradiction(videos: Mapping[str, VideoFile], cameras: Sequence[CalibratedCamera]) -> tuple[bool, str]:
+    """What the images in the middle of the videos say against the calibration, see `calibration_contradicted`."""
     indices = {name: {0: len(video.stamps) // 2} for name, video in videos.items()}
     cuts = {camera.name: Cut(0, 0, *camera.size) for camera in cameras}
     source = VideosSource(videos, indices, {camera.name: camera for camera in cameras}, cuts)
@@ -182,6 +195,50 @@ def _clocks_in_words(clocks: Mapping[str, Clock], videos: Mapping[str, VideoFile
 
     methods = " and ".join(sorted({clock.method for clock in clocks.values()}))
     return f"start in frames, by {methods}: {', '.join(one(*item) for item in clocks.items())}"
+
+
+def _notes_of_clocks(clocks: Mapping[str, Clock]) -> tuple[str, ...]:
+    guessed = next((clock.method for clock in clocks.values() if clock.method.startswith(STAMPS)), None)
+    return () if guessed is None else (f"the cameras' clocks are {guessed}",)
+
+
+def _notes_of_videos(
+    settings: ImportSettings, videos: Mapping[str, VideoFile], indices: Mapping[str, Mapping[int, int]]
+) -> tuple[str, ...]:
+    """HDR, exposures that drift, cameras that were moved.
+
+    Raises:
+        D2Error: a camera that was moved, where that is not accepted.
+    """
+    hdr = ", ".join(f"{name} ({video.hdr})" for name, video in videos.items() if video.hdr)
+    notes = [f"HDR of {hdr} was converted to BT.709: what is brighter than white paper is white"] if hdr else []
+    for name, steady in steadiness(videos, indices).items():
+        if steady.moved:
+            first, last = steady.between
+            when = f"between {first:.2f} and {last:.2f} seconds of its video"
+            said = f"camera {name} was moved by {steady.moved:.0f} pixels {when}"
+            if not settings.accept_calibration:
+                raise D2Error(
+                    f"{said}: import the parts by themselves (--times), each with its calibration, or give "
+                    "--accept-calibration true"
+                )
+            notes.append(said)
+        if steady.drift > DRIFT:
+            notes.append(f"the exposure of camera {name} drifts by {steady.drift:.0%}: lock it next time")
+    return tuple(notes)
+
+
+def _with_checked_poses(recording: Recording, report: Report) -> Recording:
+    """The recording with a note for each camera whose pose its images contradict."""
+    try:
+        turns = check_poses(recording)
+    except MissingExtra as missing:
+        report(f"poses are not checked: {missing}")
+        return recording
+    sentences = turns_in_words(turns, recording.cameras)
+    for sentence in sentences:
+        report(sentence)
+    return replace(recording, notes=(*recording.notes, *sentences[: sum(turn.wrong for turn in turns.values())]))
 
 
 def _with_refined_poses(folder: Path, recording: Recording, report: Report) -> Recording:

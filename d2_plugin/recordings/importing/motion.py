@@ -4,7 +4,11 @@ A point that moves lies, in both images of a pair of cameras, in the same half-p
 however far away it is. So the change of brightness from one frame to the next is added up per half-plane: two profiles
 over angle and time, which are alike once they are laid over each other at the right lag. Their correlation over the
 lag, summed over all pairs, has its peak where the clocks agree, and between frames too, since the profiles are
-interpolated. Gains, turns and frame rates of the cameras do not matter.
+interpolated. Gains, turns and frame rates of the cameras do not matter, and each image is first given the brightness
+of the median one, since a drift of the exposure is no motion.
+
+The error is that of leaving out one group of half-planes after another (the jackknife of Quenouille and Tukey), and of
+the disagreement of all pairs of cameras about the same offsets: where three contradict each other, it is no clock.
 """
 
 from __future__ import annotations
@@ -21,59 +25,44 @@ from d2_plugin.recordings.cameras.undistort import Undistortion
 from d2_plugin.recordings.importing.video import Decoder, VideoFile
 from d2_plugin.recordings.recording import Camera
 
-LONG_SIDE = 160
-"""Pixels of the images that are compared."""
-
-MOST_FRAMES = 900
-"""Of each camera; they take 13 MB."""
-
-FEWEST = 8
-"""Frames that a camera must share with one of the others."""
-
-ALIKE = 0.2
-"""Mean correlation that the pairs of a camera must reach."""
-
-RIVAL = 0.8
-"""Another lag that is this good, outside of the peak, makes a camera's offset doubtful."""
-
-ERROR = 0.25
-"""Frames: the standard error of an offset from motion."""
-
-PLANES = 48
-"""Half-planes between the common limits of two images."""
-
-FINE = 8
-"""Steps per frame in which lags are compared; between them lies a parabola."""
-
-NOISE = (2.0, 3.0)
-"""Change counts above this many times a pixel's usual change, and this many levels of 255 more."""
-
-LEAST_COMMON = 5
-"""Frames that two cameras must share at a lag."""
+LONG_SIDE = 160  # pixels of the images that are compared
+MOST_FRAMES = 900  # of each camera; they take 13 MB
+FEWEST = 8  # frames that a camera must share with one of the others
+ALIKE = 0.2  # mean correlation that the pairs of a camera must reach
+RIVAL = 0.8  # another lag that is this good, outside of the peak, makes a camera's offset doubtful
+VAGUE = 0.7  # frames of standard error from which motion says nothing
+LEAST_ERROR = 0.25  # frames: cameras see other sides of what moves, which no half-plane of one sort tells apart
+PLANES, GROUPS = 48, 8  # half-planes between the common limits of two images, and groups of neighbours among them
+FINE = 8  # steps per frame in which lags are compared; between them lies a parabola
+NOISE = (2.0, 3.0)  # change counts above this many times a pixel's usual change, and this many levels of 255 more
+LEAST_COMMON = 5  # frames that two cameras must share at a lag
 
 
 class Watched(NamedTuple):
     """Small images of a camera that stands still."""
 
-    camera: Camera
-    """The pinhole of the small images."""
-    images: np.ndarray
-    """[T, h, w] uint8, brightness."""
-    times: np.ndarray
-    """[T] seconds on the clock of the video."""
+    camera: Camera  # the pinhole of the small images
+    images: np.ndarray  # [T, h, w] uint8, brightness
+    times: np.ndarray  # [T] seconds on the clock of the video
 
 
 class Curve(NamedTuple):
     """How well two cameras agree at each lag."""
 
     lags: np.ndarray  # [L] in steps: the clock of the other began so much later
-    correlation: np.ndarray  # [L], 0 where too few frames are common
+    correlation: np.ndarray  # [1 + GROUPS, L] of all half-planes, then without each group; 0 at too few frames
     common: np.ndarray  # [L] frames
 
-    @property
-    def score(self) -> np.ndarray:
-        """[L] Fisher's z of the correlation times the root of the common frames: a chance peak counts less."""
-        return np.arctanh(np.clip(self.correlation, -0.999, 0.999)) * np.sqrt(self.common)
+
+class Seen(NamedTuple):
+    """What motion says about one camera."""
+
+    seconds: float  # when its clock began, after that of the first camera
+    error: float  # standard error, seconds
+    doubt: str  # why it cannot be trusted; empty where it can
+
+
+Scores = Mapping[tuple[str, str], tuple[np.ndarray, np.ndarray]]  # cameras -> (lags [L], how well they agree there [L])
 
 
 def small_images(videos: Mapping[str, VideoFile], cameras: Mapping[str, CalibratedCamera]) -> dict[str, Watched]:
@@ -94,21 +83,6 @@ def small_images(videos: Mapping[str, VideoFile], cameras: Mapping[str, Calibrat
     return watched
 
 
-Scores = Mapping[tuple[str, str], tuple[np.ndarray, np.ndarray]]
-"""Two cameras -> (lags [L] in steps, how well they agree at each [L])."""
-
-
-class Seen(NamedTuple):
-    """What motion says about one camera."""
-
-    seconds: float
-    """When its clock began, after that of the first camera."""
-    error: float
-    """Standard error, seconds."""
-    doubt: str
-    """Why it cannot be trusted; empty where it can."""
-
-
 def offsets_from_motion(watched: Mapping[str, Watched], search: float) -> dict[str, Seen]:
     """When each camera's clock began, after that of the first one.
 
@@ -117,31 +91,38 @@ def offsets_from_motion(watched: Mapping[str, Watched], search: float) -> dict[s
         search: largest difference that is looked for, seconds.
     """
     names = list(watched)
-    frame = float(np.median(np.concatenate([np.diff(one.times) for one in watched.values()])))
-    step = frame / FINE
+    # An offset cannot be known better than the slowest camera tells.
+    frame = max(float(np.median(np.diff(one.times))) for one in watched.values())
+    step = float(np.median(np.concatenate([np.diff(one.times) for one in watched.values()]))) / FINE
     changes = {name: changes_of(one) for name, one in watched.items()}
     curves = {}
     for one, other in combinations(names, 2):
         pair = curve_between(watched[one], watched[other], changes[one], changes[other], step, search)
         if pair is not None:
             curves[one, other] = pair
-    scores = {pair: (curve.lags, curve.score) for pair, curve in curves.items()}
-    offsets = _agreed(names, scores)
-    return {name: Seen(offsets[name] * step, ERROR * frame, _doubt(name, offsets, curves, scores)) for name in names}
+    whole, *without = (_scores(curves, which) for which in range(1 + GROUPS))
+    offsets = _agreed(names, whole, _tree(names, whole))
+    apart: dict[str, list[float]] = {name: [] for name in names}
+    for scores in without:
+        for name, offset in _agreed(names, scores, offsets).items():
+            apart[name].append(offset)
+    seen = {}
+    for name in names:
+        left_out = np.sqrt((GROUPS - 1) / GROUPS * np.square(np.array(apart[name]) - np.mean(apart[name])).sum())
+        error = float(np.hypot(np.hypot(left_out, _disagreement(name, offsets, whole)) * step, LEAST_ERROR * frame))
+        doubt = _doubt(name, offsets, curves, whole)
+        if not doubt and error > VAGUE * frame:
+            doubt = f"its offset is uncertain by {error / frame:.1f} frames: too little moves in it"
+        seen[name] = Seen(offsets[name] * step, error, doubt)
+    return seen
 
 
-def _agreed(names: Sequence[str], scores: Scores) -> dict[str, float]:
-    """Offsets, in steps, at which the sum of the scores of all pairs has its peak."""
-    offsets = _tree(names, scores)
-    for _ in range(20):
-        before = dict(offsets)
-        for name in names[1:]:
-            lags, total = _alone(name, offsets, scores)
-            if len(lags):
-                offsets[name] = _summit(lags, total)
-        if all(abs(offsets[name] - before[name]) < 0.01 for name in names):
-            break
-    return offsets
+def _scores(curves: Mapping[tuple[str, str], Curve], which: int) -> Scores:
+    """Fisher's z of the correlations times the root of the common frames: a chance peak counts less."""
+    return {
+        pair: (curve.lags, np.arctanh(np.clip(curve.correlation[which], -0.999, 0.999)) * np.sqrt(curve.common))
+        for pair, curve in curves.items()
+    }
 
 
 def _tree(names: Sequence[str], scores: Scores) -> dict[str, float]:
@@ -157,6 +138,20 @@ def _tree(names: Sequence[str], scores: Scores) -> dict[str, float]:
         if best is None:
             return offsets | {name: 0.0 for name in names if name not in offsets}
         offsets[best[1]] = best[2]
+    return offsets
+
+
+def _agreed(names: Sequence[str], scores: Scores, start: Mapping[str, float]) -> dict[str, float]:
+    """Offsets, in steps, at which the sum of the scores of all pairs has its peak, from a start."""
+    offsets = dict(start)
+    for _ in range(20):
+        before = dict(offsets)
+        for name in names[1:]:
+            lags, total = _alone(name, offsets, scores)
+            if len(lags):
+                offsets[name] = _summit(lags, total)
+        if all(abs(offsets[name] - before[name]) < 0.01 for name in names):
+            break
     return offsets
 
 
@@ -185,6 +180,20 @@ def _summit(places: np.ndarray, total: np.ndarray) -> float:
     return float(places[top] + np.clip(shift, -FINE / 2, FINE / 2))
 
 
+def _disagreement(name: str, offsets: Mapping[str, float], scores: Scores) -> float:
+    """Standard error, in steps, by how far the pairs of a camera each have their peak from where all together do."""
+    off, weights = [], []
+    for pair, (lags, score) in scores.items():
+        lag = offsets[pair[1]] - offsets[pair[0]]
+        near = np.abs(lags - lag) <= 2 * FINE
+        if name in pair and near.any() and score[near].max() > 0:
+            off.append(_summit(lags[near], score[near]) - lag)
+            weights.append(float(score[near].max()))
+    if len(off) < 2:
+        return 0.0
+    return float(np.sqrt(np.average(np.square(off), weights=weights) / (len(off) - 1)))
+
+
 def _doubt(name: str, offsets: Mapping[str, float], curves: Mapping[tuple[str, str], Curve], scores: Scores) -> str:
     """Why a camera's offset cannot be trusted, or nothing."""
     own = {pair: curve for pair, curve in curves.items() if name in pair}
@@ -193,7 +202,7 @@ def _doubt(name: str, offsets: Mapping[str, float], curves: Mapping[tuple[str, s
         return "it shares no view with another camera"
     lags = {pair: offsets[pair[1]] - offsets[pair[0]] for pair in own}
     shared = max(float(np.interp(lags[pair], curve.lags, curve.common)) for pair, curve in own.items())
-    alike = float(np.mean([np.interp(lags[pair], curve.lags, curve.correlation) for pair, curve in own.items()]))
+    alike = float(np.mean([np.interp(lags[pair], curve.lags, curve.correlation[0]) for pair, curve in own.items()]))
     if shared < FEWEST:
         return f"it shares {shared:.0f} frames with the others, fewer than {FEWEST}"
     if alike < ALIKE:
@@ -221,7 +230,9 @@ def _rival(total: np.ndarray, top: int) -> int | None:
 def changes_of(one: Watched) -> tuple[np.ndarray, np.ndarray]:
     """(change per second [T - 1, h, w] beyond what is usual for the pixel, the instants [T - 1] in the middle)."""
     steps = np.diff(one.times)
-    change = np.abs(np.diff(one.images.astype(np.int16), axis=0)).astype(np.float32)
+    still = np.median(one.images, axis=0) + 1
+    gains = np.median((one.images + 1.0) / still, axis=(1, 2), keepdims=True)
+    change = np.abs(np.diff(one.images / gains, axis=0)).astype(np.float32)
     usual = np.median(change, axis=0)
     change = np.maximum(change - NOISE[0] * usual - NOISE[1], 0) * (np.median(steps) / steps)[:, None, None]
     return change.astype(np.float32), (one.times[1:] + one.times[:-1]) / 2
@@ -232,6 +243,8 @@ def curve_between(
 ) -> Curve | None:
     """The agreement of two cameras over the lag; None where no half-plane is in both images."""
     angles = _angles(one.camera, other.camera)
+    if not all(np.isfinite(angle).any() for angle in angles):  # cameras at one place: no line joins them
+        return None
     low, high = (
         pick(float(np.nanquantile(angle, share)) for angle in angles) for pick, share in ((max, 0.01), (min, 0.99))
     )
@@ -294,14 +307,16 @@ def _correlated(one: np.ndarray, other: np.ndarray, starts: tuple[float, float],
     spectra = np.fft.rfft(one, size, axis=0) * np.conj(np.fft.rfft(other, size, axis=0))
     product = np.fft.irfft(spectra, size, axis=0)[shifts % size]
     sums, squares = zip(*(_running(one, begin, end), _running(other, begin - shifts, end - shifts)))
-    product = product - sums[0] * sums[1] / count[:, None]
-    spreads = [square - total**2 / count[:, None] for square, total in zip(squares, sums)]
-    size = np.sqrt(np.prod([spread.sum(1) for spread in spreads], axis=0).clip(0))
+    group = np.arange(PLANES) * GROUPS // PLANES
+    kept = np.concatenate([np.ones((1, PLANES)), group != np.arange(GROUPS)[:, None]])  # all, then without each group
+    product = kept @ (product - sums[0] * sums[1] / count[:, None]).T
+    spreads = [kept @ (square - total**2 / count[:, None]).T for square, total in zip(squares, sums)]
+    size = np.sqrt((spreads[0] * spreads[1]).clip(0))
     known = (count >= LEAST_COMMON * FINE) & (size > 1e-9)
-    correlation = np.where(known, product.sum(1) / np.where(known, size, 1), 0.0)
+    correlation = np.where(known, product / np.where(known, size, 1), 0.0)
     lags = shifts + (starts[0] - starts[1]) / step
-    kept = np.abs(lags) <= search / step + 1
-    return Curve(lags[kept], correlation[kept], count[kept] / FINE)
+    near = np.abs(lags) <= search / step + 1
+    return Curve(lags[near], correlation[:, near], count[near] / FINE)
 
 
 def _running(values: np.ndarray, begin: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

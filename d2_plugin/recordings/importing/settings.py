@@ -11,8 +11,7 @@ from typing import Annotated, Any, Literal
 from d2_plugin.errors import D2Error
 from d2_plugin.settings import Count, Positional, Range, Settings
 
-UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
-"""Metres in the units of calibration files."""
+UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}  # Metres in the units of calibration files
 
 
 @dataclass(frozen=True)
@@ -40,6 +39,8 @@ class ImportChoices(Settings):
     """Measure how much brighter one camera sees the same surfaces than the others."""
     refine_poses: bool = False
     """Correct the poses of the calibration by features of all cameras; kept as they are where that mends nothing."""
+    accept_calibration: bool = False
+    """Import though features contradict the calibration, or a camera seems to have been moved; a note says so."""
 
     intrinsics: Path | None = None
     """Without a calibration: a file with the lenses alone, in any of its formats; its poses are not used."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 
@@ -30,21 +30,10 @@ from d2_plugin.recordings.importing.settings import ImportChoices, by_camera, fi
 from d2_plugin.recordings.importing.video import VideoFile, VideoFrames
 from d2_plugin.recordings.selection import spread
 
-MOMENTS = 8
-"""Images of each camera that are read, spread over the recording."""
-
-BOARD_MOMENTS = 24
-"""The same where a board was filmed, which is held in many places."""
-
-TOGETHER = 0.1
-"""Frames by which cameras may expose apart for what moves to be a witness."""
-
-SHARED, EACH = "shared", "each"
-"""Focal lengths that are not known: one for all cameras, or one for each of them."""
-
-
-class _NeedsMotion(Exception):
-    """The clocks could be found by motion alone, which takes the calibration that is looked for."""
+MOMENTS = 8  # images of each camera that are read, spread over the recording
+BOARD_MOMENTS = 24  # the same where a board was filmed, which is held in many places
+TOGETHER = 0.1  # frames by which cameras may expose apart for what moves to be a witness
+SHARED, EACH = "shared", "each"  # focal lengths that are not known: one for all cameras, or one for each of them
 
 
 @dataclass(frozen=True)
@@ -52,8 +41,7 @@ class Lenses:
     """Cameras without poses, and whether their focal lengths are known, `SHARED` or `EACH` of its own."""
 
     cameras: dict[str, CalibratedCamera]
-    focal: str | None
-    """None where it is known."""
+    focal: str | None  # None where it is known
 
 
 def rig_of_videos(
@@ -192,8 +180,9 @@ def _images(
     videos: Mapping[str, VideoFile], lenses: Lenses, offsets: tuple[str, ...], moments: int
 ) -> dict[str, list[np.ndarray]]:
     """Undistorted images by camera: of moments that all share, or one of what stands still where none are known."""
-    clocks = _clocks(videos, offsets)
-    indices = _together(videos, clocks, moments) if clocks is not None else None
+    known = len(offsets) == 1 and offsets[0] in METHODS
+    clocks = common_clock(videos, offsets[0], None) if known else given_clock(videos, offsets)
+    indices = _together(videos, clocks, moments) if clocks else None
     chosen = indices or {name: spread(range(len(video.stamps)), moments) for name, video in videos.items()}
     frames = VideoFrames(videos, {name: dict(enumerate(places)) for name, places in chosen.items()})
     source = UndistortedSource(frames, {name: one for name, one in lenses.cameras.items() if one.lens.bends})
@@ -208,20 +197,6 @@ def _images(
     if indices is None:
         return {name: [np.median(np.stack(taken), axis=0).astype(np.uint8)] for name, taken in images.items()}
     return images
-
-
-def _clocks(videos: Mapping[str, VideoFile], offsets: tuple[str, ...]) -> Mapping[str, Clock] | None:
-    """When the cameras started; None where only motion could say it, which takes a calibration."""
-
-    def refuse() -> NoReturn:
-        raise _NeedsMotion
-
-    if len(offsets) != 1 or offsets[0] not in METHODS:
-        return given_clock(videos, offsets)
-    try:
-        return common_clock(videos, offsets[0], refuse)
-    except _NeedsMotion:
-        return None
 
 
 def _together(

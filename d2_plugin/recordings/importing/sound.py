@@ -15,14 +15,9 @@ import numpy as np
 
 from d2_plugin.recordings.importing.video import container_of, pyav
 
-RATE = 16_000
-"""Samples per second that are compared."""
-
-BAND = (100.0, 4000.0)
-"""Hertz: below is wind and hum, above is what lossy sound loses first."""
-
-MOST_SECONDS = 900.0
-"""Of the sound that is read."""
+RATE = 16_000  # samples per second that are compared
+BAND = (100.0, 4000.0)  # hertz: below is wind and hum, above is what lossy sound loses first
+MOST_SECONDS = 900.0  # of the sound that is read
 
 CLEAR = 12.0
 """A peak this many standard deviations of the correlation high is an event that both recorded. The largest of a million
@@ -34,34 +29,27 @@ DOUBTFUL = 0.6
 BLUNT = 0.45
 """As much within `ECHO` is no single peak: two claps of different events, laid over each other, look like that."""
 
-ECHO, SHARP = 0.1, 0.001
-"""Seconds around a peak in which others are its echoes, and in which they are the peak itself."""
-
-LEAST_SECONDS = 0.3
-"""Of a sound that says anything."""
+ECHO, SHARP = 0.1, 0.001  # seconds around a peak in which others are its echoes, and in which they are the peak itself
+LEAST_SECONDS = 0.3  # of a sound that says anything
 
 PART, PARTS = 1.0, 6
 """Seconds of the shortest part, and how many, in which the lag is looked for again: they say how sure it is."""
 
-AROUND = 0.05
-"""Seconds around the lag of the whole within which that of a part is looked for."""
+AROUND = 0.05  # seconds around the lag of the whole within which that of a part is looked for
 
 
 class Sound(NamedTuple):
     """The sound of a camera, one channel."""
 
-    samples: np.ndarray
-    """[N] float32 at `RATE` samples per second."""
-    start: float
-    """Seconds of the first sample on the clock of the file, which the frames share."""
+    samples: np.ndarray  # [N] float32 at `RATE` samples per second
+    start: float  # seconds of the first sample on the clock of the file, which the frames share
 
 
 class Lag(NamedTuple):
     """When the other camera started, after the first one."""
 
     seconds: float
-    error: float
-    """Standard error, seconds."""
+    error: float  # standard error, seconds
 
 
 def read_sound(path: Path) -> Sound | None:

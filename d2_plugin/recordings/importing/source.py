@@ -14,7 +14,7 @@ from d2_plugin.errors import D2Error
 from d2_plugin.reading import shown_path
 from d2_plugin.recordings.cameras.camera import CalibratedCamera
 from d2_plugin.recordings.cameras.formats.cameras_json import camera_table, read_camera
-from d2_plugin.recordings.cameras.undistort import UndistortedSource, recorded_at
+from d2_plugin.recordings.cameras.undistort import UndistortedSource
 from d2_plugin.recordings.images import opencv
 from d2_plugin.recordings.importing.settings import ImportChoices, by_camera
 from d2_plugin.recordings.importing.video import VideoFile, VideoFrames
@@ -88,8 +88,7 @@ class VideosSource(Source):
     """The images of a recording that stays in its videos; not for several threads at the same time."""
 
     videos: Mapping[str, VideoFile]
-    indices: Mapping[str, Mapping[int, int]]
-    """By camera, the video's frame of each frame of the recording."""
+    indices: Mapping[str, Mapping[int, int]]  # by camera, the video's frame of each frame of the recording
     cameras: Mapping[str, CalibratedCamera]
     cuts: Mapping[str, Cut]
     _undistorted: UndistortedSource = field(init=False, repr=False, compare=False)
@@ -103,7 +102,6 @@ class VideosSource(Source):
         return {name: self.cuts[name].camera(camera) for name, camera in self.cameras.items()}
 
     def image(self, camera: str, frame: int) -> np.ndarray:
-        """RGB uint8 [H, W, 3]: undistorted, black where nothing was recorded, cut and made smaller."""
         image = self._undistorted.image(camera, frame)
         expected = self.cameras[camera]
         if image.shape[:2] != (expected.height, expected.width):
@@ -115,8 +113,10 @@ class VideosSource(Source):
         return self.cuts[camera].of(image)
 
     def recorded(self, camera: str) -> np.ndarray | None:
-        """Which pixels [h, w] were recorded, or None where all were."""
-        valid = valid_pixels(self.cameras[camera], self.cuts[camera])
+        whole = self._undistorted.recorded(camera)
+        if whole is None:
+            return None
+        valid = self.cuts[camera].of(whole.astype(np.float32)) > 0.99
         return None if valid.all() else valid
 
     def as_dict(self) -> dict[str, Any]:
@@ -142,11 +142,3 @@ class VideosSource(Source):
             {name: read_camera(entry["camera"], str(folder)) for name, entry in table.items()},
             {name: Cut(**entry["cut"]) for name, entry in table.items()},
         )
-
-
-def valid_pixels(camera: CalibratedCamera, cut: Cut) -> np.ndarray:
-    """Which pixels of what is left [h, w] were recorded by the camera, bool."""
-    width, height = cut.size
-    columns, rows = np.arange(width) + 0.5, np.arange(height) + 0.5
-    x, y = np.meshgrid(columns / width * cut.width + cut.left, rows / height * cut.height + cut.top)
-    return recorded_at(camera, np.stack([x, y], axis=-1))

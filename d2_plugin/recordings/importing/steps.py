@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from itertools import islice
@@ -12,21 +13,20 @@ from typing import Any
 
 from d2_plugin.durable import Kind, is_leftover, read_table, write_table
 from d2_plugin.errors import D2Error
+from d2_plugin.locks import only_writer
 from d2_plugin.reading import json_text, opened, reaching, shown_path
 from d2_plugin.recordings.cameras.camera import check_name
 from d2_plugin.recordings.importing.settings import ImportSettings
 from d2_plugin.recordings.importing.video import VIDEO_SUFFIXES, videos_below
 
-STEPS = "import"
-"""Folder of what each step gave."""
+STEPS = "import"  # folder of what each step gave
+
+SOLVED = "calibration.json"  # of poses that were found from the videos
 
 KIND = Kind("step of an import", 1, "delete it, it will be made again")
 
-MOST_FILES = 1000
-"""Of a calibration that is a folder."""
-
-ENDS = 1 << 20
-"""Bytes at either end of a file that stand for it."""
+MOST_FILES = 1000  # of a calibration that is a folder
+ENDS = 1 << 20  # bytes at either end of a file that stand for it
 
 
 def paths_of(settings: ImportSettings) -> dict[str, Path]:
@@ -63,14 +63,18 @@ def identity(settings: ImportSettings, paths: Mapping[str, Path]) -> dict[str, A
 
 
 def refuse_another(folder: Path, wanted: Mapping[str, Any]) -> None:
-    """Raise where the folder holds something else than this import; nothing is written."""
+    """Raise where the folder holds something else than this import; steps of another one without images are removed."""
     if folder.exists() and not folder.is_dir():
         raise D2Error(f"{folder} is a file, and a recording needs a folder: give another --output")
     kept_settings = folder / STEPS / "import.json"
     if kept_settings.is_file():
         there = read_table(kept_settings, KIND)
         changed = sorted(key for key in {*there, *wanted} if there.get(key) != wanted.get(key))
-        if changed:
+        if changed and all(is_leftover(inside) or inside.name in (STEPS, SOLVED) for inside in folder.iterdir()):
+            with only_writer(folder):
+                shutil.rmtree(folder / STEPS)
+                (folder / SOLVED).unlink(missing_ok=True)
+        elif changed:
             raise D2Error(
                 f"{folder} holds another import, made with other {', '.join(changed)}: give another --output, or "
                 "remove that folder"

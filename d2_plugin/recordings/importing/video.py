@@ -1,7 +1,8 @@
 """A video: what its container says about it, and its images by their time stamps, decoded when asked for (PyAV).
 
 Times are those of the container, so a variable frame rate is honoured; frame numbers times a rate would not be. The
-file is walked through once without decoding more than one frame.
+file is walked through once without decoding more than one frame; AVI, which says no more than the order of decoding, is
+decoded once, and its frames are counted.
 """
 
 from __future__ import annotations
@@ -25,22 +26,20 @@ from d2_plugin.recordings.recording import Source
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm", ".mts", ".m2ts", ".mpg", ".mpeg", ".360", ".lrv")
 """Endings by which a folder's videos are listed."""
 
-REMEDY = "replace the file or leave its camera out"
+BT709 = 1  # FFmpeg's number of the transfer function and of the primaries of SDR
+
+HDR, WIDE = {16: "PQ", 18: "HLG"}, {9: "BT.2020"}  # the same of what HDR has
 
 SKIP_LIMIT = 48
 """A frame at most this far ahead is reached by decoding on; any other by a seek, which starts at a key frame."""
 
-MOST_FRAMES = 10_000_000
-"""A video that has more is damaged: this many are four days at 30 per second."""
+MOST_FRAMES = 10_000_000  # A video that has more is damaged: this many are four days at 30 per second
 
-ATOMS = (b"ftyp", b"styp", b"moov", b"mdat", b"free", b"skip", b"wide", b"pnot")
-"""What an MP4 or MOV may begin with, behind its length."""
-
-BEGINNINGS = (b"\x1aE\xdf\xa3", b"\0\0\1\xba", b"\0\0\1\xb3")
-"""Of Matroska and WebM, of an MPEG program stream and of MPEG video."""
-
-PACKETS = ((0, 188), (4, 196))
-"""Where the first two packets of an MPEG transport stream begin, without and with time codes."""
+OPENING = {
+    "format_whitelist": "mov,matroska,webm,avi,mpeg,mpegts,mpegvideo",
+    "protocol_whitelist": "file",
+}
+"""Options of FFmpeg, which else follows playlists and scripts to other files and addresses."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,16 +47,16 @@ class VideoFile:
     """One video as its container describes it."""
 
     path: Path
-    stored_size: tuple[int, int]
-    """(width, height) in pixels before the turn."""
-    turn: int
-    """How a stored image becomes an upright one: 0, 90, 180 or 270 degrees, counter-clockwise."""
-    stamps: np.ndarray
-    """[N] int64, ascending: when each frame is shown, in units of `unit`."""
-    unit: Fraction
-    """Seconds."""
+    stored_size: tuple[int, int]  # (width, height) in pixels before the turn
+    turn: int  # how a stored image becomes an upright one: 0, 90, 180 or 270 degrees, counter-clockwise
+    stamps: np.ndarray  # [N] int64, ascending: when each frame is shown, in units of `unit`
+    unit: Fraction  # seconds
     timecode: str | None = None
     sound: bool = False
+    counted: bool = (
+        False  # frames are found by their order, since what the container says of their times is not ordered
+    )
+    hdr: str = ""  # how its colours are coded where that is no BT.709, such as "PQ, BT.2020"; they are converted
 
     @property
     def size(self) -> tuple[int, int]:
@@ -85,16 +84,18 @@ class VideoFile:
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values, from which `from_dict` makes the same."""
-        kept = {"path": str(self.path), "size": list(self.stored_size), "turn": self.turn, "sound": self.sound}
         unit = [self.unit.numerator, self.unit.denominator]
-        return {**kept, "timecode": self.timecode, "unit": unit, "stamps": self.stamps.tolist()}
+        return {**vars(self), "path": str(self.path), "unit": unit, "stamps": self.stamps.tolist()}
 
     @classmethod
     def from_dict(cls, table: Mapping[str, Any]) -> VideoFile:
         """What `as_dict` made."""
-        (width, height), stamps = table["size"], np.array(table["stamps"], np.int64)
-        unit = Fraction(*table["unit"])
-        return cls(Path(table["path"]), (width, height), table["turn"], stamps, unit, table["timecode"], table["sound"])
+        arrays = {"stamps": np.array(table["stamps"], np.int64), "stored_size": tuple(table["stored_size"])}
+        return cls(**{**table, **arrays, "path": Path(table["path"]), "unit": Fraction(*table["unit"])})
+
+
+def _remedy(path: Path) -> str:
+    return f"replace the file or leave camera {path.stem} out"
 
 
 def pyav() -> ModuleType:
@@ -105,20 +106,25 @@ def pyav() -> ModuleType:
 @contextmanager
 def container_of(path: Path) -> Iterator[Any]:
     """The opened file; whatever FFmpeg says against it becomes one sentence."""
-    av = pyav()
-    _check_container(path)
-    with parsing(f"video {shown_path(path)}", REMEDY), av.open(str(path)) as container:
+    with parsing(f"video {shown_path(path)}", _remedy(path)), open_container(path) as container:
         yield container
 
 
-def _check_container(path: Path) -> None:
-    """Refuse what holds no video itself: FFmpeg also follows playlists and scripts to other files and addresses."""
-    with opened(path, REMEDY) as file:  # a pipe or a device would block
-        head = file.read(256)
-    riff = head[:4] == b"RIFF" and head[8:11] == b"AVI"
-    transport = any(head[first : first + 1] == b"G" == head[second : second + 1] for first, second in PACKETS)
-    if not (riff or transport or head[4:8] in ATOMS or head[:4] in BEGINNINGS):
-        raise D2Error(f"{shown_path(path)} is no video in an MP4, MOV, Matroska, WebM, AVI or MPEG container: {REMEDY}")
+def open_container(path: Path) -> Any:
+    """The file as PyAV opens it.
+
+    Raises:
+        D2Error: no file, or one of another kind.
+    """
+    av = pyav()
+    with opened(path, _remedy(path)):  # a pipe or a device would block
+        pass
+    try:
+        return av.open(str(path), options=OPENING)
+    except av.error.ArgumentError:
+        raise D2Error(
+            f"{shown_path(path)} is no video in an MP4, MOV, Matroska, WebM, AVI or MPEG container: {_remedy(path)}"
+        ) from None
 
 
 def read_video(path: Path) -> VideoFile:
@@ -128,50 +134,55 @@ def read_video(path: Path) -> VideoFile:
         D2Error: no video, no frame, a first frame that cannot be decoded, or sizes that no video has.
     """
     with container_of(path) as container:
-        stream = _image_stream(container, path)
-        stamps, unit = _stamps(container, stream, path), Fraction(stream.time_base)
+        if not container.streams.video:
+            kinds = " and ".join(sorted({stream.type for stream in container.streams})) or "nothing"
+            raise D2Error(f"{shown_path(path)} holds {kinds} and no image: give a video of the camera")
+        stream = container.streams.video[0]
+        counted, unit = container.format.name == "avi", Fraction(stream.time_base)
+        stamps = _stamps(container.decode(stream) if counted else _packets(container, stream), path)
         places = [container, *container.streams.video, *container.streams]
         timecode = next((place.metadata["timecode"] for place in places if "timecode" in place.metadata), None)
         sound = bool(container.streams.audio)
-    size, turn = _first_frame(path)
-    return VideoFile(path, size, turn, stamps, unit, timecode, sound)
+    first = _first_frame(path)
+    turn = 90 * (round(float(first.rotation) / 90) % 4)
+    coding = [
+        name for table, code in ((HDR, first.color_trc), (WIDE, first.color_primaries)) if (name := table.get(code))
+    ]
+    return VideoFile(path, (first.width, first.height), turn, stamps, unit, timecode, sound, counted, ", ".join(coding))
 
 
-def _image_stream(container: Any, path: Path) -> Any:
-    if not container.streams.video:
-        kinds = " and ".join(sorted({stream.type for stream in container.streams})) or "nothing"
-        raise D2Error(f"{shown_path(path)} holds {kinds} and no image: give a video of the camera")
-    return container.streams.video[0]
+def _packets(container: Any, stream: Any) -> Iterator[Any]:
+    """Those that hold a frame that is shown: an edit list may leave some out."""
+    return (packet for packet in container.demux(stream) if packet.size and not packet.is_discard)
 
 
-def _stamps(container: Any, stream: Any, path: Path) -> np.ndarray:
-    """When each frame is shown; frames that an edit list leaves out are none."""
+def _stamps(shown: Iterator[Any], path: Path) -> np.ndarray:
+    """When each frame is shown, ascending, of packets or of decoded frames."""
     stamps: set[int] = set()
-    for packet in container.demux(stream):
-        stamp = packet.dts if packet.pts is None else packet.pts
-        if stamp is not None and packet.size and not packet.is_discard:
+    for one in shown:
+        stamp = one.dts if one.pts is None else one.pts
+        if stamp is not None:
             stamps.add(stamp)
         if len(stamps) > MOST_FRAMES:
-            raise D2Error(f"video {shown_path(path)} has more than {MOST_FRAMES} frames: {REMEDY}")
+            raise D2Error(f"video {shown_path(path)} has more than {MOST_FRAMES} frames: {_remedy(path)}")
     if not stamps:
-        raise D2Error(f"video {shown_path(path)} has no frame: {REMEDY}")
+        raise D2Error(f"video {shown_path(path)} has no frame: {_remedy(path)}")
     return np.array(sorted(stamps), np.int64)
 
 
-def _first_frame(path: Path) -> tuple[tuple[int, int], int]:
-    """(size as stored, turn) of the images, from the first one."""
+def _first_frame(path: Path) -> Any:
     with container_of(path) as container:
         try:
             frame = next(container.decode(video=0))
         except (StopIteration, pyav().error.FFmpegError) as failure:
             why = f" ({said(failure)})" if not isinstance(failure, StopIteration) else ""
-            raise D2Error(f"no frame of video {shown_path(path)} can be decoded{why}: {REMEDY}") from None
-        if not 0 < frame.width * frame.height <= MOST_PIXELS:
-            raise D2Error(
-                f"video {shown_path(path)} has images of {frame.width}x{frame.height} pixels, at most {MOST_PIXELS}: "
-                f"{REMEDY}"
-            )
-        return (frame.width, frame.height), 90 * (round(float(frame.rotation) / 90) % 4)
+            raise D2Error(f"no frame of video {shown_path(path)} can be decoded{why}: {_remedy(path)}") from None
+    if not 0 < frame.width * frame.height <= MOST_PIXELS:
+        raise D2Error(
+            f"video {shown_path(path)} has images of {frame.width}x{frame.height} pixels, at most {MOST_PIXELS}: "
+            f"{_remedy(path)}"
+        )
+    return frame
 
 
 def usual_rate(rate: float) -> float:
@@ -203,7 +214,16 @@ class Decoder:
         Raises:
             D2Error: the frame cannot be decoded, or only in part.
         """
-        return self.video.upright(self._frame(index).to_ndarray(format="rgb24"))
+        frame = self._frame(index)
+        if self.video.hdr:  # what is brighter than white paper, 203 candela per square metre, becomes white
+            try:
+                frame = frame.reformat(format="rgb24", dst_color_trc=BT709, dst_color_primaries=BT709)
+            except TypeError:  # PyAV before it knew transfer functions
+                raise D2Error(
+                    f"{shown_path(self.video.path)} is HDR ({self.video.hdr}), which this PyAV cannot convert: run "
+                    "`pip install -U av`, or convert the video to BT.709"
+                ) from None
+        return self.video.upright(frame.to_ndarray(format="rgb24"))
 
     def grey(self, index: int, long_side: int) -> np.ndarray:
         """Brightness uint8 [h, w] of frame `index`, upright, made small: at most `long_side` pixels."""
@@ -225,8 +245,7 @@ class Decoder:
         try:
             self._approach(index)
             for frame in self._frames:
-                stamp = frame.pts if frame.pts is not None else frame.dts
-                place = -1 if stamp is None else int(np.searchsorted(self.video.stamps, stamp))
+                place = self._place(frame)
                 if place < index:
                     continue
                 self._reached = place
@@ -237,18 +256,27 @@ class Decoder:
             why = f" ({said(failure)})"
         self.close()
         raise D2Error(
-            f"frame {index} of {shown_path(self.video.path)} cannot be decoded{why}: repair the video, leave its "
-            "camera out, or choose other --times"
+            f"frame {index} of {shown_path(self.video.path)} cannot be decoded{why}: repair the video, leave "
+            f"camera {self.video.path.stem} out, or choose other --times"
         )
+
+    def _place(self, frame: Any) -> int:
+        """Which frame of the video it is."""
+        if self.video.counted:
+            self._reached += 1
+            return self._reached
+        stamp = frame.pts if frame.pts is not None else frame.dts
+        return -1 if stamp is None else int(np.searchsorted(self.video.stamps, stamp))
 
     def _approach(self, index: int) -> None:
         """Open the file where it is not, and stand at most `SKIP_LIMIT` frames before `index` if one can."""
+        if self.video.counted and index <= self._reached:
+            self.close()
         if self._container is None:
-            _check_container(self.video.path)
-            self._container = pyav().open(str(self.video.path))
+            self._container = open_container(self.video.path)
             self._container.streams.video[0].thread_type = "AUTO"
             self._frames = self._container.decode(video=0)
-        if not 0 < index - self._reached <= SKIP_LIMIT:
+        if not self.video.counted and not 0 < index - self._reached <= SKIP_LIMIT:
             stream = self._container.streams.video[0]
             self._container.seek(int(self.video.stamps[index]), stream=stream, backward=True)
             self._frames = self._container.decode(video=0)
@@ -264,7 +292,6 @@ class VideoFrames(Source):
     _decoders: dict[str, Decoder] = field(default_factory=dict, repr=False, compare=False)
 
     def image(self, camera: str, frame: int) -> np.ndarray:
-        """RGB uint8 [H, W, 3]."""
         index = frame if self.indices is None else self.indices[camera].get(frame)
         if index is None:
             raise D2Error(f"camera {camera} has no frame {frame}: choose one of the recording's frames")

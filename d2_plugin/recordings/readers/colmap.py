@@ -23,8 +23,7 @@ from d2_plugin.recordings.files import Shot, by_camera, cameras_with_images, com
 from d2_plugin.recordings.images import image_size
 from d2_plugin.recordings.recording import Recording
 
-COLMAP_FPS = 30.0
-"""Frame rate that is assumed, with a note: a COLMAP model says nothing about time."""
+COLMAP_FPS = 30.0  # frame rate that is assumed, with a note: a COLMAP model says nothing about time
 
 
 def is_colmap(path: Path) -> bool:

@@ -13,11 +13,8 @@ from d2_plugin.recordings.files import cameras_with_images, common_frames, numbe
 from d2_plugin.recordings.images import image_size
 from d2_plugin.recordings.recording import Recording
 
-ENERF_FPS = 60.0
-"""Frame rate at which EasyVolcap plays the data set; the files name none."""
-
-NOT_USED = ("bkgd", "vhull", "background.ply")
-"""What recordings of this layout may also hold."""
+ENERF_FPS = 60.0  # frame rate at which EasyVolcap plays the data set; the files name none
+NOT_USED = ("bkgd", "vhull", "background.ply")  # what recordings of this layout may also hold
 
 
 def is_enerf(path: Path) -> bool:

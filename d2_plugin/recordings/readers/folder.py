@@ -28,8 +28,7 @@ from d2_plugin.values import Range
 
 CALIBRATION = "cameras.json"
 
-DEFAULT_FPS = 30.0
-"""Frame rate that is assumed, with a note, where cameras.json names none."""
+DEFAULT_FPS = 30.0  # frame rate that is assumed, with a note, where cameras.json names none
 
 GAIN = Annotated[float, Range(1e-3, 1e3)]
 ERROR = Annotated[float, Range(0, 1e3)]

@@ -34,8 +34,7 @@ log = logging.getLogger(__name__)
 
 POSES = "poses_bounds.npy"
 
-N3DV_FPS = 30.0
-"""Frame rate of the data set, where no video says it."""
+N3DV_FPS = 30.0  # frame rate of the data set, where no video says it
 
 UNSYNCHRONISED = {"coffee_martini": ("cam13",)}
 """Cameras whose video is not synchronised with the others. MixVoxels and K-Planes leave them out, too."""

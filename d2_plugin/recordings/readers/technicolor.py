@@ -27,14 +27,11 @@ from d2_plugin.recordings.images import IMAGE_SUFFIXES, image_size
 from d2_plugin.recordings.recording import Recording
 
 PARAMETERS = "cameras_parameters.txt"
-UNDISTORTED, DISTORTED = 12, 14
-"""Numbers in a line of the two releases."""
+UNDISTORTED, DISTORTED = 12, 14  # numbers in a line of the two releases
 
 TECHNICOLOR_FPS = 30.0
 
-DAMAGED = {
-    "birthday": {("09", 12): 13, ("09", 173): 172, ("02", 255): 254},
-}
+DAMAGED = {"birthday": {("09", 12): 13, ("09", 173): 172, ("02", 255): 254}}
 """Images of the data set that cannot be decoded, by scene, camera and frame, and the frame that stands in for each.
 Public loaders of the data set do the same."""
 

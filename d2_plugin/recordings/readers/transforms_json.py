@@ -23,8 +23,7 @@ from d2_plugin.recordings.recording import Recording
 FILES = ("transforms.json", "transforms_train.json", "transforms_val.json", "transforms_test.json")
 """All that are there are read; their images are joined."""
 
-STATIC_FPS = 30.0
-"""Frame rate of files without times, where it means nothing."""
+STATIC_FPS = 30.0  # frame rate of files without times, where it means nothing
 
 
 class _Entry(NamedTuple):

@@ -51,9 +51,5 @@ def _refuse_changed(video: VideoFile, name: str) -> None:
             "with --images png, which needs no videos afterwards"
         )
     now = read_video(video.path)
-    if (
-        now.stored_size != video.stored_size
-        or len(now.stamps) != len(video.stamps)
-        or (now.stamps != video.stamps).any()
-    ):
+    if (now.stored_size, now.stamps.tolist()) != (video.stored_size, video.stamps.tolist()):
         raise D2Error(f"{shown_path(video.path)} is not the video that was imported: put it back, or import again")

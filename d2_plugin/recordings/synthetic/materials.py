@@ -10,8 +10,7 @@ import math
 
 import numpy as np
 
-SIZE = 256
-"""Texels along each side of a texture."""
+SIZE = 256  # texels along each side of a texture
 
 
 def sample(texture: np.ndarray, uv: np.ndarray) -> np.ndarray:

@@ -14,11 +14,8 @@ import numpy as np
 from d2_plugin.recordings.recording import Camera
 from d2_plugin.recordings.synthetic.materials import sample
 
-Motion = Callable[[float], tuple[np.ndarray, np.ndarray]]
-"""Seconds -> (rotation [3, 3] object to world, centre [3])."""
-
-SHADOW_BIAS = 1e-6
-"""Shadow rays start this fraction of the way to the light, so that no surface shades itself."""
+Motion = Callable[[float], tuple[np.ndarray, np.ndarray]]  # seconds -> (rotation [3, 3] object to world, centre [3])
+SHADOW_BIAS = 1e-6  # shadow rays start this fraction of the way to the light, so that no surface shades itself
 
 
 @dataclass(frozen=True, eq=False)

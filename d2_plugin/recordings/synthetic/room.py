@@ -25,11 +25,8 @@ from d2_plugin.recordings.synthetic import materials
 from d2_plugin.recordings.synthetic.raycast import Motion, Room, Scene, Solid, render_color, render_depth
 from d2_plugin.values import checked_arguments
 
-CACHE_BYTES = 64 * 2**20
-"""Images kept after rendering them, oldest forgotten first."""
-
-TARGET = np.array([0.0, 0.1, 0.75])
-"""World point (metres, z up) that every camera looks at."""
+CACHE_BYTES = 64 * 2**20  # images kept after rendering them, oldest forgotten first
+TARGET = np.array([0.0, 0.1, 0.75])  # world point (metres, z up) that every camera looks at
 
 ROOM_LOW, ROOM_HIGH = np.array([-2.6, -5.0, 0.0]), np.array([2.6, 2.0, 2.9])
 """Corners of the room; the cameras stand inside."""
@@ -134,15 +131,12 @@ class SyntheticSource(Source):
     _cache: OrderedDict[tuple[str, str, int], np.ndarray] = field(default_factory=OrderedDict, repr=False)
 
     def image(self, camera: str, frame: int) -> np.ndarray:
-        """RGB uint8 [H, W, 3]."""
         return self._kept("image", camera, frame, render_color)
 
     def depth(self, camera: str, frame: int) -> np.ndarray:
-        """Exact planar z float32 [H, W]; every ray meets a surface."""
         return self._kept("depth", camera, frame, render_depth)
 
     def mono(self, camera: str, frame: int) -> np.ndarray:
-        """Emulated monocular prediction float32 [H, W]: affine-invariant inverse depth, larger is nearer."""
         number = list(self.cameras).index(camera)
         depth = self.depth(camera, frame)
         fixed = np.random.default_rng([self.seed, 1, number])

@@ -135,9 +135,9 @@ def called_alike(given: Filmed) -> None:
 CASES: list[tuple[Callable[[Filmed], object], list[str], str]] = [
     (no_frames, [], r"has no frame|no frame of video"),
     (damaged, [], r"can(not)? be decoded.*(repair|replace) the"),
-    (cut_off, [], r"cannot read video .*03\.mp4.*replace the file or leave its camera out"),
-    (overwritten("videos/03.mp4", b"not a video\n" * 1000), [], r"03\.mp4.*replace the file or leave its camera out"),
-    (overwritten("videos/03.mp4", b""), [], r"03\.mp4.*replace the file or leave its camera out"),
+    (cut_off, [], r"cannot read video .*03\.mp4.*replace the file or leave camera 03 out"),
+    (overwritten("videos/03.mp4", b"not a video\n" * 1000), [], r"03\.mp4.*replace the file or leave camera 03 out"),
+    (overwritten("videos/03.mp4", b""), [], r"03\.mp4.*replace the file or leave camera 03 out"),
     (only_sound, [], r"03\.mp4 holds audio and no image: give a video"),
     (lambda given: [path.unlink() for path in given.videos.iterdir()], [], r"holds no video: give videos, or a folder"),
     (called_alike, [], r"are both called 03: name each video like its camera"),
@@ -164,6 +164,9 @@ CASES: list[tuple[Callable[[Filmed], object], list[str], str]] = [
         r"puts all cameras at one place: give a calibration with their poses|does not fit",
     ),
     (edited(lambda c: c["all"]["cameras"].remove(c["03"])), [], r"no camera for 03"),
+    (edited(lambda c: c["03"].update(R=c["02"]["R"], t=c["02"]["t"])), [], r"cameras 02 and 03 the identical pose"),
+    (overwritten("cameras.json", b"<?xml version='1.0'?><calibration/>"), [], r"of Qualisys: convert it to TOML with"),
+    (overwritten("cameras.json", b"<?xml version='1.0'?><opencv_storage/>"), [], r"XML of OpenCV.*write intri.yml"),
     (overwritten("cameras.json", b"{]"), [], r"not JSON|no calibration that can be read"),
     (overwritten("cameras.json", None), [], r"no such calibration|there is no such file|is not there"),
     (lambda given: None, ["--offsets", "07=3"], r"--offsets names camera '07', have 02, 03, 04"),
@@ -212,11 +215,28 @@ def test_another_import_and_another_folder_are_not_written_over(
     assert main([*command, "--frames", "0:2"]) == 2
     assert "holds another import, made with other frames: give another --output" in capsys.readouterr().err
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
+    refused = [*command[:-4], "--offsets", "none", "--scale", "0.3"]
+    refused[5] = str(tmp_path / "later")
+    assert main([*refused, "--frames", "500"]) == 2
+    assert main([*refused, "--frames", "0:4:2"]) == 0, "a refused import leaves nothing that blocks its own advice"
+    later = open_recording(tmp_path / "later")
+    assert later.rate == pytest.approx(later.fps / 2)
+    capsys.readouterr()
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.txt").write_text("mine")
     assert main([*command[:5], str(tmp_path / "mine"), "--frames", "0:1"][:6]) == 2
     assert "is not empty and holds no import" in capsys.readouterr().err
     assert [path.name for path in (tmp_path / "mine").iterdir()] == ["thesis.txt"]
+
+
+def test_who_knows_better_imports_all_the_same(given: Filmed, tmp_path: Path, capsys) -> None:
+    of_another_rig(given)
+    words = ["import", str(given.videos), "--calibration", str(given.calibration), "--output", str(tmp_path / "c")]
+    words += ["--exposure", "false", "--offsets", "none", "--frames", "0:1", "--images", "videos"]
+    assert main(words) == 2
+    assert "or give --accept-calibration true" in capsys.readouterr().err
+    assert main([*words, "--accept-calibration", "true"]) == 0
+    assert any("misses features" in note for note in open_recording(tmp_path / "c").notes)
 
 
 def test_one_video_of_another_event(room: Recording, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -225,7 +245,7 @@ def test_one_video_of_another_event(room: Recording, tmp_path: Path, capsys: pyt
     words = ["import", str(take.videos), "--calibration", str(take.calibration), "--output", str(tmp_path / "c")]
     assert main([*words, "--offsets", "sound"]) == 2
     said = capsys.readouterr().err
-    assert "nothing in the sound links 04 with 02, 03: leave the camera out, give the offsets" in said
+    assert "nothing in the sound links 04 with 02, 03: leave camera 04 out, give the offsets" in said
 
 
 def test_timecode_against_sound(room: Recording, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

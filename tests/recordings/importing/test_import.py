@@ -19,7 +19,7 @@ from d2_plugin.recordings.cameras.lens import Lens
 from d2_plugin.recordings.checks.lacking import lacking_text
 from d2_plugin.recordings.importing.importing import import_videos
 from d2_plugin.recordings.importing.settings import ImportSettings
-from d2_plugin.recordings.importing.source import Cut, valid_pixels
+from d2_plugin.recordings.importing.source import Cut, VideosSource
 from d2_plugin.recordings.importing.steps import KIND
 from d2_plugin.recordings.selection import select_frames
 
@@ -135,7 +135,7 @@ def test_crop_and_scale_move_the_camera_with_the_image(filmed: Filmed, imported:
 def test_margins_of_undistorted_images_are_not_valid() -> None:
     K = np.array([[90.0, 0, 50], [0, 90, 40], [0, 0, 1]])
     camera = CalibratedCamera("a", 100, 80, Lens(K, "opencv", (0.3,)), np.eye(4))
-    valid = valid_pixels(camera, Cut(0, 0, 100, 80, 0.5))
+    valid = VideosSource({}, {}, {"a": camera}, {"a": Cut(0, 0, 100, 80, 0.5)}).recorded("a")
     assert valid.shape == (40, 50)
     assert valid[20, 25]
     assert not valid[0, 0]

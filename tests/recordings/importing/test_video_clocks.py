@@ -12,7 +12,7 @@ import pytest
 from recorded import SOUND_RATE, graded, room_sound
 
 from d2_plugin.errors import D2Error
-from d2_plugin.recordings import Recording, open_recording
+from d2_plugin.recordings import Camera, Recording, open_recording
 from d2_plugin.recordings.importing.clocks import (
     Evidence,
     _solved,
@@ -98,7 +98,7 @@ CASES = [
 
 
 @pytest.mark.parametrize(("scene", "names", "frames"), CASES)
-def test_motion_finds_the_offset_within_half_a_frame(
+def test_motion_finds_the_offset_within_two_of_its_errors_and_half_a_frame(
     shared_data: Callable[[str], Path], scene: str, names: list[str], frames: list[int]
 ) -> None:
     recording = open_recording(shared_data(scene))
@@ -106,7 +106,8 @@ def test_motion_finds_the_offset_within_half_a_frame(
     seen = offsets_from_motion(watched(recording, names, offsets, np.random.default_rng(0)), search=1.0)
     for name in names:
         assert not seen[name].doubt
-        assert abs(seen[name].seconds * recording.fps - offsets[name]) < 0.5
+        off = abs(seen[name].seconds * recording.fps - offsets[name])
+        assert off < min(0.5, 2 * seen[name].error * recording.fps)
 
 
 def test_motion_of_another_event_is_doubted(shared_data: Callable[[str], Path]) -> None:
@@ -120,6 +121,23 @@ def test_motion_of_another_event_is_doubted(shared_data: Callable[[str], Path]) 
     videos["03"] = videos["03"]._replace(images=other.astype(np.uint8))
     seen = offsets_from_motion(videos, search=1.0)
     assert seen["03"].doubt
+
+
+def test_what_motion_cannot_say_the_files_of_one_recorder_say() -> None:
+    camera = Camera("a", 32, 24, np.array([[30.0, 0, 16], [0, 30.0, 12], [0, 0, 1]]), np.eye(4))
+    aside = replace(camera, T_camera_world=np.array([[1.0, 0, 0, 0.5], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]))
+    still = np.full((10, 24, 32), 90, np.uint8)
+    times = np.arange(10) / 25
+    watching = {"a": Watched(camera, still, times), "b": Watched(aside, still, times)}
+    alike = {"a": a_video(25, None), "b": a_video(25, None)}
+    clocks = common_clock(alike, "auto", lambda: watching)
+    assert [clock.seconds for clock in clocks.values()] == [0.0, 0.0]
+    assert clocks["b"].error == pytest.approx(0.5 / 25)
+    assert clocks["b"].method.startswith("the files' own stamps")
+    assert "motion does not say" in clocks["b"].method
+    longer = replace(alike["b"], stamps=np.arange(14))
+    with pytest.raises(D2Error, match="motion does not say when .* started"):
+        common_clock({**alike, "b": longer}, "auto", lambda: watching)
 
 
 def a_video(rate: int, timecode: str | None) -> VideoFile:

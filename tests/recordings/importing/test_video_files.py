@@ -9,6 +9,7 @@ import pytest
 from recorded import write_video
 
 from d2_plugin.errors import D2Error
+from d2_plugin.recordings.importing.steady import steadiness
 from d2_plugin.recordings.importing.video import Decoder, VideoFile, read_video
 
 pytest.importorskip("av")
@@ -76,10 +77,75 @@ def test_small_brightness_has_the_shape_of_the_upright_image(unsteady: tuple[Pat
     assert grey.shape == (24, 32)
 
 
+@pytest.mark.parametrize(("codec", "tag"), [("mpeg4", "XVID"), ("libx264", "H264")])
+def test_b_frames_in_avi_come_in_the_order_in_which_they_are_shown(codec: str, tag: str, tmp_path: Path) -> None:
+    """AVI holds the order of decoding alone, and what FFmpeg makes of it does not always rise."""
+    import av
+
+    with av.open(str(tmp_path / "a.avi"), "w") as container:
+        stream = container.add_stream(codec, rate=30)
+        stream.height, stream.width, stream.pix_fmt = *SIZE, "yuv420p"
+        stream.bit_rate, stream.gop_size = 2_000_000, 12
+        stream.codec_context.max_b_frames, stream.codec_context.codec_tag = 2, tag
+        for image in images(30):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
+        container.mux(stream.encode())
+    video = read_video(tmp_path / "a.avi")
+    assert len(video.stamps) == 30
+    assert video.rate == pytest.approx(30, rel=1e-3)
+    decoder = Decoder(video)
+    for index in (0, 1, 2, 3, 11, 12, 13, 29, 5):
+        assert np.abs(decoder.image(index).astype(int) - images(30)[index]).mean() < 4, index
+
+
+def test_hdr_becomes_what_other_cameras_show(tmp_path: Path) -> None:
+    """White paper, 203 candela per square metre, is white, and a quarter of that the grey that BT.709 has for it."""
+    import av
+
+    names = "colorprim=bt2020:transfer=smpte2084:colormatrix=bt2020nc"
+    with av.open(str(tmp_path / "a.mp4"), "w") as container:
+        stream = container.add_stream("libx264", rate=25)
+        stream.height, stream.width, stream.pix_fmt, stream.options = (
+            *SIZE,
+            "yuv420p",
+            {"x264-params": names, "crf": "1"},
+        )
+        for _ in range(3):
+            frame = av.VideoFrame(SIZE[1], SIZE[0], "yuv420p")
+            for plane, code in zip(frame.planes, (143, 128, 128), strict=True):  # 203 candela in PQ, of 16 to 235
+                plane.update(bytes([code]) * plane.buffer_size)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    video = read_video(tmp_path / "a.mp4")
+    assert video.hdr == "PQ, BT.2020"
+    assert Decoder(video).image(1).min() > 245
+
+
 @pytest.mark.parametrize("suffix", [".mp4", ".mov", ".mkv", ".mts", ".m2ts", ".avi"])
 def test_the_containers_of_cameras_are_read(suffix: str, tmp_path: Path) -> None:
     path = write_video(tmp_path / f"a{suffix}", images(5), [i / 25 for i in range(5)])
     assert len(read_video(path).stamps) == 5
+
+
+def wall(count: int, shift: int = 0, gain: float = 1.0) -> list[np.ndarray]:
+    """A wall of soft noise; from the middle on it lies `shift` pixels beside, and it becomes brighter up to `gain`."""
+    cv2 = pytest.importorskip("cv2")
+    noise = np.random.default_rng(0).uniform(0, 255, (120, 200, 1))
+    soft = (cv2.GaussianBlur(noise, (0, 0), 3)[..., None] - 128) * 5 + 110
+    gains = np.linspace(1, gain, count)
+    views = [np.roll(soft, shift * (2 * i >= count), axis=1)[:, 20:180] * gains[i] for i in range(count)]
+    return [np.repeat(view.clip(0, 255).round().astype(np.uint8), 3, axis=2) for view in views]
+
+
+@pytest.mark.parametrize(("shift", "gain", "moved", "drift"), [(0, 1, 0, 0), (12, 1, 12, 0), (0, 1.25, 0, 0.25)])
+def test_a_camera_that_was_moved_or_drifts_is_noticed(
+    shift: int, gain: float, moved: float, drift: float, tmp_path: Path
+) -> None:
+    video = read_video(write_video(tmp_path / "a.mp4", wall(24, shift, gain), [i / 24 for i in range(24)]))
+    steady = steadiness({"a": video}, {"a": {i: i for i in range(24)}})["a"]
+    assert steady.moved == pytest.approx(moved, abs=1)
+    assert steady.drift == pytest.approx(drift, abs=0.02)
+    assert not moved or steady.between[0] <= 0.5 <= steady.between[1]
 
 
 @pytest.mark.parametrize(
@@ -95,5 +161,5 @@ def test_the_containers_of_cameras_are_read(suffix: str, tmp_path: Path) -> None
 def test_playlists_and_scripts_are_no_videos_and_lead_nowhere(text: str, tmp_path: Path) -> None:
     write_video(tmp_path / "a.mp4", images(5), [i / 25 for i in range(5)])
     (tmp_path / "b.mp4").write_text(text)
-    with pytest.raises(D2Error, match=r"b\.mp4 is no video in an MP4, MOV, .* container"):
+    with pytest.raises(D2Error, match=r"b\.mp4 (is no video in an MP4, MOV, .* container|\(Invalid data)"):
         read_video(tmp_path / "b.mp4")

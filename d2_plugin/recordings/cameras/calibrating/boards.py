@@ -22,18 +22,15 @@ from d2_plugin.recordings.images import checked_image, opencv
 from d2_plugin.settings import Positive, Range, Settings
 from d2_plugin.values import checked_arguments
 
-FEWEST_SIDES = 4
-"""Sides of squares that must be measured."""
+FEWEST_SIDES = 4  # sides of squares that must be measured
 
 LARGEST_SPREAD = 0.05
 """Interquartile range of the measured sides, as a share of their median, beyond which they say no scale."""
 
-CORNER_ERROR = 4.0
-"""Reprojection error beyond which a corner is left out, in `pixel_error`."""
+CORNER_ERROR = 4.0  # reprojection error beyond which a corner is left out, in `pixel_error`
 
 
-Squares = Annotated[int, Range(3, 1000)]
-"""How many squares a board has along a side."""
+Squares = Annotated[int, Range(3, 1000)]  # how many squares a board has along a side
 
 
 @dataclass(frozen=True)

@@ -13,16 +13,14 @@ from d2_plugin.recordings.cameras.calibrating.features import Features, Matches,
 from d2_plugin.recordings.cameras.camera import pinhole, rigid
 from d2_plugin.recordings.recording import Camera
 
-SMALLEST_ANGLE = 1.0
-"""Degrees between the rays of a point below which its depth is a guess."""
+SMALLEST_ANGLE = 1.0  # degrees between the rays of a point below which its depth is a guess
 
 
 @dataclass(frozen=True, eq=False)
 class Tracks:
     """What cameras saw of the same things: one row per thing at one moment."""
 
-    names: tuple[str, ...]
-    """All cameras, in the order of the columns."""
+    names: tuple[str, ...]  # all cameras, in the order of the columns
     seen: np.ndarray  # [n, cameras] int, index into the camera's list of features, -1 where it did not see it
 
     def column(self, name: str) -> np.ndarray:

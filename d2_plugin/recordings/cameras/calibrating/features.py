@@ -21,32 +21,19 @@ from d2_plugin.recordings.cameras.epipolar import sampson, sift_features
 from d2_plugin.recordings.images import opencv
 from d2_plugin.recordings.recording import Camera
 
-MOST_FEATURES = 4000
-"""Per image."""
-
-LEAST_CONTRAST = 0.005
-"""An eighth of OpenCV's: faint features are many, and geometry sorts out false matches."""
-
-RATIO = 0.85
-"""The best match is nearer than the second best by this factor, on square roots of SIFT."""
-
-CHANGE = 10.0
-"""Levels of 255 by which an image differs from what usually is there where something moves."""
-
-ENOUGH_MATCHES = 15
-"""Verified matches below which two cameras say nothing about each other."""
-
-PIXEL_ERROR = 1.5
-"""Largest distance of a match from its epipolar line, in pixels of images of up to `LONG_SIDE`."""
+MOST_FEATURES = 4000  # per image
+LEAST_CONTRAST = 0.005  # an eighth of OpenCV's: faint features are many, and geometry sorts out false matches
+RATIO = 0.85  # the best match is nearer than the second best by this factor, on square roots of SIFT
+CHANGE = 10.0  # levels of 255 by which an image differs from what usually is there where something moves
+ENOUGH_MATCHES = 15  # verified matches below which two cameras say nothing about each other
+PIXEL_ERROR = 1.5  # largest distance of a match from its epipolar line, in pixels of images of up to `LONG_SIDE`
 
 LONG_SIDE = 960.0
 
-LEAST_INLIERS = 0.05
-"""Share of inliers that RANSAC looks for, at least."""
+LEAST_INLIERS = 0.05  # share of inliers that RANSAC looks for, at least
 
 Pair = tuple[str, str]
-Matches = dict[Pair, np.ndarray]
-"""Two cameras -> indices [m, 2] into their lists of features."""
+Matches = dict[Pair, np.ndarray]  # two cameras -> indices [m, 2] into their lists of features
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,7 +133,7 @@ def verified(
     for (a, b), pairs in matches.items():
         if near is not None:
             p, q = features[a].pixels[pairs[:, 0]], features[b].pixels[pairs[:, 1]]
-            pairs = pairs[sampson(cameras[a], cameras[b], p, q) < near]
+            pairs = pairs[np.abs(sampson(cameras[a], cameras[b], p, q)) < near]
         result = _ransac((a, b), pairs, features, cameras)
         inside = np.zeros(len(pairs), bool) if result is None else np.asarray(result["inlier_mask"], bool)
         if inside.sum() >= ENOUGH_MATCHES:

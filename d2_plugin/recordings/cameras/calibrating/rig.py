@@ -11,11 +11,11 @@ from d2_plugin.errors import D2Error
 from d2_plugin.recordings.cameras.calibrating.bundle import Bundle
 from d2_plugin.recordings.cameras.calibrating.features import Features
 from d2_plugin.recordings.cameras.camera import rig_width, rigid
+from d2_plugin.recordings.cameras.epipolar import degrees_between
 from d2_plugin.recordings.recording import Camera
 from d2_plugin.values import checked_arguments
 
-ARBITRARY = "arbitrary: give the distance of two cameras, or video a board"
-"""Of a scale that nothing says."""
+ARBITRARY = "arbitrary: give the distance of two cameras, or video a board"  # of a scale that nothing says
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,10 +23,8 @@ class SolvedRig:
     """A rig that was solved; the first camera's axes are the world's, and the width of the rig is 1."""
 
     cameras: dict[str, Camera]
-    pixels: dict[str, float]
-    """Camera -> median reprojection error in pixels."""
-    seen: dict[str, int]
-    """Camera -> points that it sees."""
+    pixels: dict[str, float]  # camera -> median reprojection error in pixels
+    seen: dict[str, int]  # camera -> points that it sees
     doubt: dict[str, tuple[float, float]]
     """Camera -> (degrees, share of the rig's width) that two halves of the images differ by: about two standard
     deviations."""
@@ -94,25 +92,20 @@ def aligned(cameras: Mapping[str, Camera], onto: Mapping[str, Camera]) -> dict[s
 
     Rotations settle the turn because the centres of two cameras, or of several on a line, do not.
     """
-    rotation, scale, shift = similarity(cameras, onto)
-    laid = {}
-    for name, camera in cameras.items():
-        R = camera.T_camera_world[:3, :3] @ rotation.T
-        centre = scale * rotation @ camera.centre + shift
-        laid[name] = replace(camera, T_camera_world=rigid(R, -R @ centre))
-    return laid
-
-
-def similarity(cameras: Mapping[str, Camera], onto: Mapping[str, Camera]) -> tuple[np.ndarray, float, np.ndarray]:
-    """(R [3, 3], s, t [3]): x in the world of `cameras` is s R x + t in that of `onto`."""
     names = [name for name in cameras if name in onto]
     between = sum(onto[name].T_camera_world[:3, :3].T @ cameras[name].T_camera_world[:3, :3] for name in names)
     left, _, right = np.linalg.svd(between)
     rotation = left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right
     here, there = (np.stack([rig[name].centre for name in names]) for rig in (cameras, onto))
-    spread = np.linalg.norm(here - here.mean(axis=0))
-    scale = float(np.linalg.norm(there - there.mean(axis=0)) / spread) if spread > 0 else 1.0
-    return rotation, scale, there.mean(axis=0) - scale * rotation @ here.mean(axis=0)
+    middle, goal = here.mean(axis=0), there.mean(axis=0)
+    spread = np.linalg.norm(here - middle)
+    scale = float(np.linalg.norm(there - goal) / spread) if spread > 0 else 1.0
+    laid = {}
+    for name, camera in cameras.items():
+        R = camera.T_camera_world[:3, :3] @ rotation.T
+        centre = goal + scale * rotation @ (camera.centre - middle)
+        laid[name] = replace(camera, T_camera_world=rigid(R, -R @ centre))
+    return laid
 
 
 def differences(cameras: Mapping[str, Camera], onto: Mapping[str, Camera]) -> dict[str, tuple[float, float]]:
@@ -121,8 +114,6 @@ def differences(cameras: Mapping[str, Camera], onto: Mapping[str, Camera]) -> di
     laid = aligned(cameras, onto)
     apart = {}
     for name in laid:
-        turn = laid[name].T_camera_world[:3, :3] @ onto[name].T_camera_world[:3, :3].T
-        sine = np.linalg.norm(turn - turn.T) / (2 * np.sqrt(2))  # accurate at small angles, as a cosine is not
-        degrees = np.rad2deg(np.arctan2(sine, (np.trace(turn) - 1) / 2))
-        apart[name] = (float(degrees), float(np.linalg.norm(laid[name].centre - onto[name].centre) / width))
+        degrees = degrees_between(laid[name], onto[name])
+        apart[name] = (degrees, float(np.linalg.norm(laid[name].centre - onto[name].centre) / width))
     return apart

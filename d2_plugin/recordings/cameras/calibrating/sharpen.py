@@ -18,22 +18,14 @@ from d2_plugin.recordings.cameras.calibrating.features import Features, pixel_er
 from d2_plugin.recordings.images import opencv
 from d2_plugin.recordings.recording import Camera
 
-RADIUS = 5
-"""Pixels from the middle of a patch to its edge: larger ones reach over edges of things."""
-
-WIDTH = 3.5
-"""Standard deviation, pixels, of the weight of a patch's pixels."""
+RADIUS = 5  # pixels from the middle of a patch to its edge: larger ones reach over edges of things
+WIDTH = 3.5  # standard deviation, pixels, of the weight of a patch's pixels
 
 ROUNDS = 10
 
-ALIKE = 0.9
-"""Correlation of two patches below which they show different things."""
-
-STILL = 0.03
-"""Pixels of the last round's move beyond which there is no result."""
-
-LARGEST_MOVE = 2.0
-"""Farther from where the feature was found, in `pixel_error`, it is another thing."""
+ALIKE = 0.9  # correlation of two patches below which they show different things
+STILL = 0.03  # pixels of the last round's move beyond which there is no result
+LARGEST_MOVE = 2.0  # farther from where the feature was found, in `pixel_error`, it is another thing
 
 FINER, FINEST = 4, 4096
 """Images are enlarged this often before they are sampled, up to so many pixels along a side: OpenCV places samples at

@@ -39,27 +39,21 @@ from d2_plugin.recordings.images import checked_image
 from d2_plugin.recordings.recording import Camera
 from d2_plugin.values import checked_arguments
 
-FINE = (*SCHEDULE, (1.0, 0.1), (0.5, 0.05))
-"""Rounds of the adjustment for features that were moved to better places."""
+FINE = (*SCHEDULE, (1.0, 0.1), (0.5, 0.05))  # rounds of the adjustment for features that were moved to better places
 
 LARGEST_DOUBT = (0.2, 0.006)
 """Degrees, and share of the rig's width, that two halves of the images may differ by about a camera."""
 
-LARGEST_FOCAL_DOUBT = 0.03
-"""Share that they may differ by about a focal length."""
+LARGEST_FOCAL_DOUBT = 0.03  # share that they may differ by about a focal length
 
 FOCALS = np.geomspace(0.45, 2.4, 9)
 """Focal lengths that are tried where none is known, in longer sides of the image: 96 to 24 degrees across."""
 
-STARTS = 2
-"""Pairs of cameras that are tried as a start, the most promising first."""
-
-FEWEST_SEEN = 12
-"""Points that settle a camera, at least, and as a share of those it should see."""
+STARTS = 2  # pairs of cameras that are tried as a start, the most promising first
+FEWEST_SEEN = 12  # points that settle a camera, at least, and as a share of those it should see
 LEAST_SHARE = 0.25
 
-GROWING = ((8.0, 1.3), (4.0, 0.4))
-"""Rounds of the adjustment while cameras are added, as `refine.SCHEDULE`."""
+GROWING = ((8.0, 1.3), (4.0, 0.4))  # rounds of the adjustment while cameras are added, as `refine.SCHEDULE`
 
 ADD = (
     "add stills on the way between the cameras (at most 20 degrees apart), bring neighbouring cameras closer together, "

@@ -18,16 +18,18 @@ from d2_plugin.values import Range, shown
 
 CORRECT = "correct the file, see docs/calibration.md"
 
-MOST_BYTES = 1 << 26
-"""Larger calibrations are refused: a rig of 500 cameras takes a few hundred kilobytes."""
+MOST_BYTES = 1 << 26  # larger calibrations are refused: a rig of 500 cameras takes a few hundred kilobytes
+DEEPEST = 64  # of lists and tables within each other in YAML
 
-DEEPEST = 64
-"""Of lists and tables within each other in YAML."""
+XML = {
+    "<opencv_storage": "XML of OpenCV, which no rig is read from: write intri.yml and extri.yml, or Pose2Sim's TOML",
+    "<calibration": "a calibration of Qualisys: convert it to TOML with Pose2Sim (`calib_qca_to_toml`)",
+}
+"""What XML begins with -> what it is, and what to do: these are named, not read."""
 
 NUMBER = Annotated[float, Range(-LARGEST_NUMBER, LARGEST_NUMBER)]
 
-Table = dict[str, Any]
-"""What stands between braces in a file, or under a heading: names and whatever the file says."""
+Table = dict[str, Any]  # what stands between braces in a file, or under a heading: names and whatever the file says
 
 
 class Document:
@@ -52,6 +54,9 @@ class Document:
                 "Pose2Sim's or OpenCap's own tool"
             )
         text = read_text(self.path, CORRECT, MOST_BYTES)
+        named = next((tool for mark, tool in XML.items() if mark in text[:4096]), None)
+        if named is not None and text.lstrip().startswith("<"):
+            raise D2Error(f"{self.path} is {named}")
         if re.match(r"\s*(\{|\[\s*\{)", text):
             return parse_json(text, self.place, CORRECT)
         if text.startswith("%YAML"):

@@ -27,8 +27,7 @@ from d2_plugin.recordings.cameras.rotations import rotation_of_vector
 
 Cameras = Optional[list[CalibratedCamera]]  # noqa: UP045  at run time, on Python 3.9 too
 
-CENTIMETRES = 0.01
-"""Of the positions in CMU Panoptic's files, in metres."""
+CENTIMETRES = 0.01  # of the positions in CMU Panoptic's files, in metres
 
 KALIBR_DISTORTIONS = {"radtan": ("opencv", 4), "equidistant": ("fisheye", 4), "none": ("pinhole", 0)}
 """Kalibr's name -> model and number of coefficients."""

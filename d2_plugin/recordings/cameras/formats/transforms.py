@@ -20,11 +20,8 @@ from d2_plugin.recordings.cameras.formats.document import CORRECT, NUMBER, Docum
 from d2_plugin.recordings.cameras.lens import checked_lens
 from d2_plugin.recordings.files import arrange
 
-SAME_POSE = 1e-5
-"""Largest difference of the matrices of one camera; these files are converted, not estimated per image."""
-
-TIME_DIGITS = 12
-"""Decimals of a time that count: splits are written by programs that divide in another order."""
+SAME_POSE = 1e-5  # largest difference of the matrices of one camera; these files are converted, not estimated per image
+TIME_DIGITS = 12  # decimals of a time that count: splits are written by programs that divide in another order
 
 NAMES = ("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y", "k1", "k2", "k3", "k4", "p1", "p2")
 """Of numbers that describe a camera."""
@@ -33,13 +30,10 @@ NAMES = ("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y
 class ListedImage(NamedTuple):
     """One image of the list `frames`."""
 
-    name: str
-    """Its path as the file has it, without a leading ./"""
-    matrix: np.ndarray
-    """[4, 4] from camera to world, OpenGL axes."""
+    name: str  # its path as the file has it, without a leading ./
+    matrix: np.ndarray  # [4, 4] from camera to world, OpenGL axes
     time: float | None
-    table: Table
-    """What stands beside the image, and at the top of the file where that says nothing else."""
+    table: Table  # what stands beside the image, and at the top of the file where that says nothing else
 
 
 def listed_images(content: Table, where: str) -> list[ListedImage]:
