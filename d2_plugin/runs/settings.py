@@ -14,7 +14,18 @@ from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.hooks import HOOKS
 from d2_plugin.priors.settings import PriorSettings
 from d2_plugin.reading import said, shown_path
-from d2_plugin.settings import FORMAT, Count, Positional, Range, Seed, Settings, Share, declared, of_this_format
+from d2_plugin.settings import (
+    FORMAT,
+    Count,
+    Downscale,
+    Positional,
+    Range,
+    Seed,
+    Settings,
+    Share,
+    declared,
+    of_this_format,
+)
 from d2_plugin.values import shown
 
 HOOK_NAMES = ("prior", *HOOKS)
@@ -48,13 +59,13 @@ class RunSettings(Settings):
     """Cameras to train with, as the recording names them."""
     backbone: str = "yang4d"
     """Name of a registered backbone."""
-    iterations: Annotated[int, Range(1, 10**9, unit="steps")] = 3000
+    iterations: Annotated[int, Range(1, unit="steps")] = 3000
     """Steps to train."""
     hooks: tuple[str, ...] = HOOK_NAMES
     """Parts of the method that are used."""
     seed: Seed = 0
     """Seed of everything that is drawn at random."""
-    downscale: Annotated[int, Range(1, 65_535)] = 1
+    downscale: Downscale = 1
     """Make images this many times smaller along each side."""
     frames: tuple[Count, ...] | None = None
     """Numbers of the frames to use; all if not given."""

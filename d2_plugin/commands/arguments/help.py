@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 import textwrap
 from collections.abc import Collection, Sequence
-from dataclasses import MISSING, replace
+from dataclasses import MISSING
 
 from d2_plugin.commands.arguments.form import HELP, Form, Section, typed_as
 from d2_plugin.commands.arguments.text import bare, flag_of, item_kind, limits, placeholder, shown
@@ -14,9 +14,6 @@ from d2_plugin.settings import Declared, Range
 
 COLUMN = 30
 """Where the explanations begin."""
-
-LARGE = 1e15
-"""An upper bound beyond this is the machine's and not worth reading."""
 
 
 def help_text(form: Form, words: Sequence[str]) -> str:
@@ -88,10 +85,8 @@ def _explained(setting: Declared) -> str:
 
 
 def _bounds(where: Range) -> str:
-    if where.high is not None and where.high > LARGE:
-        where = replace(where, high=None)
-    bounds = str(where) if (where.low, where.high) != (None, None) else ""
-    return ", ".join(part for part in (where.unit, bounds) if part)
+    bounds = where.described()
+    return ", ".join(part for part in (where.unit, bounds) if part not in ("", "finite"))
 
 
 def _default(setting: Declared) -> str:

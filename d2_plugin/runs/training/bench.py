@@ -25,7 +25,7 @@ from d2_plugin.runs.rows import TRY, Row, append_rows, command_line, read_rows
 from d2_plugin.runs.settings import RunSettings
 from d2_plugin.runs.shared import Job, Shared, share, share_points
 from d2_plugin.runs.training.measured import Line, Work, follow, workers
-from d2_plugin.settings import AtATime, AtLeastOne, Count, Positional, Positive, Range, Seed, Settings
+from d2_plugin.settings import AtATime, Count, Downscale, Positional, Range, Seed, Settings
 
 PILOT = 100
 """Steps of the first try."""
@@ -48,7 +48,7 @@ class TrainingBench(Settings):
     """Recordings with their cameras, as PATH@TRAIN+TRAIN or PATH@TRAIN+TRAIN@SCORE+SCORE."""
     methods: tuple[str, ...] = ("backbone", "mvs_only", "full")
     """Rows or tables of `d2 ablate`."""
-    seconds: tuple[Positive, ...] = ()
+    seconds: tuple[Annotated[float, Range(1e-3, 1e7, unit="seconds")], ...] = ()
     """CPU seconds of training to compare at; 10, 30 and 100 if neither these nor steps are given."""
     steps: tuple[Annotated[int, Range(1, unit="steps")], ...] = ()
     """Numbers of steps to compare at."""
@@ -60,7 +60,7 @@ class TrainingBench(Settings):
     """Numbers of the frames, in every recording; all if not given."""
     hold_out_instants: Annotated[int, Range(0, 10_000, unit="instants")] = 0
     """Train every so-manieth instant alone and score those between apart; 0 or 1 trains all."""
-    downscale: AtLeastOne = 1
+    downscale: Downscale = 1
     """Make images this many times smaller along each side."""
     mono_onnx: str | None = None
     """ONNX model of monocular depth; the recordings' own maps if not given."""
