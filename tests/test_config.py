@@ -82,7 +82,10 @@ def test_a_file_says_its_version_and_another_one_is_refused(tmp_path: Path) -> N
         ({"raster": {"near": -1}}, r"backbone\.raster\.near must be above 0 world units, got -1"),
         ({"raster": {"alpha_max": 1}}, r"backbone\.raster\.alpha_max must be above 0 and below 1, got 1"),
         ({"mlp": {"width": 0}}, r"backbone\.mlp\.width must be at least 1 and at most 8192, got 0"),
-        ({"hexplane": {"resolutions": [8, 0]}}, r"backbone\.hexplane\.resolutions\[1\] must be at least 1 and at most 1024, got 0"),
+        (
+            {"hexplane": {"resolutions": [8, 0]}},
+            r"hexplane\.resolutions\[1\] must be at least 1 and at most 1024, got 0",
+        ),
         ({"hexplane": {"resolutions": []}}, r"resolutions has no level: give at least one"),
         ({"field": "hexplan"}, r"unknown backbone\.field 'hexplan': have hexplane, mlp; did you mean 'hexplane'"),
         ({"mlp": {"widht": 3}}, r"unknown setting of backbone\.mlp 'widht'.*did you mean 'width'"),

@@ -1,7 +1,7 @@
 """What a run keeps in its folder, whose folder it is, and that no model is kept that diverged.
 
 run.json and metrics.json are tables with a checksum. checkpoint.pt is what `torch.save` writes, with the version of its
-form; zip's own checksums guard every tensor.
+form and a checksum of all its bytes, which are compared before torch sees them.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from d2_plugin.durable import (
     Damaged,
     Kind,
     OtherFormat,
-    archive_problem,
     is_leftover,
     make_folder,
+    opened_archive,
     read_table,
-    write,
+    write_archive,
     write_table,
 )
 from d2_plugin.errors import D2Error
@@ -128,7 +128,7 @@ def save_checkpoint(path: Path, state: Mapping[str, Any]) -> None:
     """Write a state of plain values and tensors; a kill or a full disk leaves the checkpoint before it."""
     content = io.BytesIO()  # torch ends the process where a file that it writes itself cannot be written
     torch.save({**state, "format": CHECKPOINT_FORMAT}, content)
-    write(path, content.getbuffer())
+    write_archive(path, content)
 
 
 def load_checkpoint(path: Path, device: str) -> dict[str, Any] | None:
@@ -139,11 +139,8 @@ def load_checkpoint(path: Path, device: str) -> dict[str, Any] | None:
     """
     if not path.exists():
         return None
-    problem = archive_problem(path)
-    if problem:
-        raise Damaged(f"the checkpoint {path} is damaged ({problem}): {_REMEDY}")
-    with fitting(path):
-        state = torch.load(path, map_location=device, weights_only=True)
+    with opened_archive(path, "checkpoint", _REMEDY) as file, fitting(path):
+        state = torch.load(file, map_location=device, weights_only=True)
     form = state.get("format") if isinstance(state, dict) else None
     if form != CHECKPOINT_FORMAT:
         raise OtherFormat(
