@@ -161,10 +161,14 @@ def prior_settings(settings: RunSettings) -> PriorSettings:
 def hook_config(settings: RunSettings, priors: Path) -> D2Config:
     """The hooks of a run with schedules that fit its length, and the user's tables over the defaults."""
     hooks = tuple(name for name in settings.hooks if name != "prior")
+    d2 = settings.overrides.get("d2", {})
+    for name in d2 if isinstance(d2, Mapping) else ():
+        if name in HOOKS:
+            raise D2Error(f"d2.{name} is a table of its own: write its settings under [{name}]")
     config = for_iterations(hooks, settings.iterations, prior=str(priors), seed=settings.seed)
     plain = {name: value for name, value in asdict(config).items() if name not in HOOKS}
     tables = {name: _over(asdict(getattr(config, name)), settings.overrides.get(name, {}), name) for name in hooks}
-    return D2Config.from_dict(_over(plain, settings.overrides.get("d2", {}), "d2") | tables)
+    return D2Config.from_dict(_over(plain, d2, "d2") | tables)
 
 
 def _over(defaults: Mapping[str, Any], table: Any, name: str) -> dict[str, Any]:
