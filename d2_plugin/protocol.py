@@ -224,6 +224,8 @@ class Backbone(Protocol):
         called with the number of the training step before anything else is asked in it.
     ``image_name(camera) -> str | None``
         path of the image of a trainer's camera; priors of an exported recording are found by it.
+    ``image(camera) -> Tensor | None``
+        RGB [3, H, W] in 0..1 of a trainer's camera: asked for once per view, and held against the prior's colours.
     ``active(step) -> bool``
         False while the hooks must wait (stages, warm-up); changes nothing.
     ``colors(view, splats) -> Tensor``

@@ -13,6 +13,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from d2_plugin.errors import D2Error
+from d2_plugin.hooks.expected import check_colors, check_prior
 from d2_plugin.protocol import CameraRecord, DepthPrior, Label, View
 
 log = logging.getLogger(__name__)
@@ -167,6 +168,8 @@ class PriorLoader:
         self._known: dict[tuple[str, int], KnownMaps] = {}
         self._cameras = CameraCheck()
         self._without: set[str] = set()
+        self.images: dict[tuple[str, int], Tensor] = {}
+        """Colours of the images that are trained on (`small_image`), until the prior of their view is read."""
         self.named = False
         """Whether `name_by` was called."""
 
@@ -218,6 +221,7 @@ class PriorLoader:
         return sum(part.numel() * part.element_size() for part in tensors)
 
     def _check(self, view: View, prior: DepthPrior) -> None:
+        check_prior(prior, f"the prior of camera {view.camera}, frame {view.frame}")
         height, width = prior.depth.shape
         if (width, height) != (view.width, view.height):
             raise D2Error(
@@ -228,6 +232,9 @@ class PriorLoader:
         record = describe(view.camera, view.frame) if describe is not None else None
         if record is not None:
             self._cameras.check(view, record, prior.depth)
+        image = self.images.pop((view.camera, view.frame), None)
+        if image is not None and prior.colors is not None:
+            check_colors(view, image, prior.colors)
 
 
 def _usable(prior: DepthPrior) -> DepthPrior:

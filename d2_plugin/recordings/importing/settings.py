@@ -93,8 +93,12 @@ def by_camera(
         D2Error: a camera that is not among `names`, or what is no value.
     """
     values: dict[str, Any] = {}
+    seen: list[str] = []
     for text in texts:
         name, named, written = text.rpartition("=")
+        if named and name in seen:
+            raise D2Error(f"{option} names camera '{name}' twice: leave one of them out")
+        seen += [name] if named else []
         if named and name not in names:
             raise D2Error(f"{option} names camera '{name}', have {', '.join(names)}: correct the name")
         given = value(written.strip())

@@ -22,8 +22,27 @@ from d2_plugin.reading import opened, parsing, said, shown_path
 from d2_plugin.recordings.images import MOST_PIXELS
 from d2_plugin.recordings.recording import Source
 
-VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm", ".mts", ".m2ts", ".mpg", ".mpeg", ".360", ".lrv")
+VIDEO_SUFFIXES = (
+    ".mp4",
+    ".mov",
+    ".m4v",
+    ".mkv",
+    ".avi",
+    ".webm",
+    ".mts",
+    ".m2ts",
+    ".mpg",
+    ".mpeg",
+    ".360",
+    ".lrv",
+    ".ts",
+)
 """Endings by which a folder's videos are listed."""
+
+NOT_READ = (".gif", ".sdp", ".m3u8", ".wmv", ".flv", ".ogv", ".3gp", ".vob", ".mxf", ".h264", ".hevc", ".r3d", ".braw")
+"""Endings of videos that no reader here opens."""
+
+_log = logging.getLogger(__name__)
 
 REMEDY = "replace the file or leave its camera out"
 
@@ -184,6 +203,9 @@ def usual_rate(rate: float) -> float:
 def videos_below(folder: Path) -> tuple[Path, ...]:
     """The videos directly in a folder, sorted by name."""
     paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in VIDEO_SUFFIXES)
+    left = sorted(path.name for path in folder.iterdir() if path.suffix.lower() in NOT_READ)
+    if left:
+        _log.warning("%s: %s left out, of a kind that is not read: convert to MP4", folder, ", ".join(left))
     return tuple(path for path in paths if not path.name.startswith("."))
 
 

@@ -137,7 +137,7 @@ def case_of(text: str, base: RunSettings) -> Case:
     train, test, _ = resolve_cameras(path, named[0], named[1] if len(named) > 1 else None)
     protocol = split_name(named[0])
     settings = replace(base, recording=path, train_cameras=train, test_cameras=test, protocol=protocol)
-    title = Path(path).resolve().name
+    title = Path(os.path.realpath(path)).name
     size = f", 1/{base.downscale} size" if base.downscale > 1 else ""
     slug = "_".join([title, *train]) + (f"_small{base.downscale}" if base.downscale > 1 else "")
     if base.hold_out_instants > 1:
