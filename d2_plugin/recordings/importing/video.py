@@ -6,6 +6,7 @@ file is walked through once without decoding more than one frame.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
