@@ -140,8 +140,16 @@ def _write_new(path: Path, parts: tuple[bytes | memoryview, ...], synced: bool) 
         os.close(descriptor)
 
 
+def refuse_inside_images(path: Path) -> None:
+    """Refuse a place inside the images of a recording: a folder more would be a camera without a calibration."""
+    for folder in Path(os.path.realpath(path)).parents:
+        if folder.name == "images" and (folder.parent / "cameras.json").is_file():
+            raise D2Error(f"{path} is inside {folder}, where every folder is a camera: give another --output")
+
+
 def refuse_foreign(path: Path, sign: str, command: str) -> None:
     """Refuse to replace a file without the sign, among its first 1000 bytes, of the command that writes it."""
+    refuse_inside_images(path)
     if path.exists():
         with opened(path, "give another --output") as file:
             if sign.encode() not in file.read(1000):

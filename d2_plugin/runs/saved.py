@@ -7,7 +7,6 @@ form and a checksum of all its bytes, which are compared before torch sees them.
 from __future__ import annotations
 
 import io
-import os
 import pickle
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -25,6 +24,7 @@ from d2_plugin.durable import (
     make_folder,
     opened_archive,
     read_table,
+    refuse_inside_images,
     write_archive,
     write_table,
 )
@@ -86,9 +86,7 @@ def read_metrics(folder: Path) -> dict[str, Any]:
 
 def claim(folder: Path, identity: Mapping[str, Any]) -> None:
     """Take the folder, or find this very run in it; anything else is refused and nothing is written."""
-    images = Path(identity["recording"], "images")
-    if Path(os.path.realpath(folder)).is_relative_to(images):
-        raise D2Error(f"{folder} is inside {images}, where every folder is a camera: give another --output")
+    refuse_inside_images(folder)
     if folder.exists() and not folder.is_dir():
         raise D2Error(f"{folder} is a file, and a run needs a folder: give another --output")
     if (folder / "run.json").exists():
