@@ -23,6 +23,7 @@ from typing import Any, BinaryIO, NamedTuple
 
 from d2_plugin.errors import D2Error
 from d2_plugin.reading import MOST_TEXT, json_text, opened
+from d2_plugin.values import shown
 
 LEFTOVER = ".part"
 """How the temporary names end; what a killed process left behind is found by it."""
@@ -200,7 +201,7 @@ def read_table(path: Path, kind: Kind) -> dict[str, Any]:
         raise Damaged(f"the {kind.name} {path} is damaged ({error}): {kind.remedy}") from None
     if table.get("format") != kind.format:
         raise OtherFormat(
-            f"the {kind.name} {path} has format {table.get('format')} but this version reads format {kind.format}: "
+            f"the {kind.name} {path} has format {shown(table.get('format'))} but this version reads format {kind.format}: "
             f"{kind.remedy}"
         )
     if table.pop("seal", None) != _seal(table):

@@ -117,11 +117,11 @@ def check_prior(prior: object, name: str) -> None:
         raise D2Error(f"{name} has no depth as a map [H, W] of floating-point numbers: give tensors")
     if any(part is not None and part.shape[:2] != depth.shape for part in (labels, *others)):
         raise D2Error(f"{name} has maps of several sizes: give all of them {tuple(depth.shape)} as its depth")
-    known = (labels != Label.EMPTY) & (labels != Label.CONFLICT)
-    unknown, wrong = (labels < 0) | (labels > max(Label)), known & ~(depth.isfinite() & (depth > 0))
-    if bool((unknown | wrong).any()):
+    fits = (depth > 0) & (depth < torch.inf) | (labels == Label.EMPTY) | (labels == Label.CONFLICT)
+    unknown = labels.byte() > max(Label)
+    if not bool(fits.all()) or bool(unknown.any()):
         raise D2Error(
-            f"{name} has {int(unknown.sum())} labels that are none of 0 to {int(max(Label))}, and {int(wrong.sum())} "
+            f"{name} has {int(unknown.sum())} labels that are none of 0 to {int(max(Label))}, and {int((~fits).sum())} "
             "pixels whose label says that a depth is known and whose depth is NaN, infinite or not above 0: label "
             f"these {int(Label.EMPTY)}"
         )

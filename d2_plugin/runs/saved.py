@@ -34,6 +34,7 @@ from d2_plugin.hooks import finite
 from d2_plugin.hooks.finite import Diverged
 from d2_plugin.locks import only_writer
 from d2_plugin.runs.settings import RunSettings
+from d2_plugin.values import shown
 
 RUN = Kind("table of settings", 1, "run `d2 train` with another --output, or remove that folder")
 """run.json."""
@@ -143,7 +144,7 @@ def load_checkpoint(path: Path, device: str) -> dict[str, Any] | None:
     form = state.get("format") if isinstance(state, dict) else None
     if form != CHECKPOINT_FORMAT:
         raise OtherFormat(
-            f"the checkpoint {path} has format {form} but this version reads format {CHECKPOINT_FORMAT}: "
+            f"the checkpoint {path} has format {shown(form)} but this version reads format {CHECKPOINT_FORMAT}: "
             "continue it with the d2-4dgs that wrote it, or remove the file to train from the start"
         )
     return state
