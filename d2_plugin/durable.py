@@ -201,8 +201,8 @@ def read_table(path: Path, kind: Kind) -> dict[str, Any]:
         raise Damaged(f"the {kind.name} {path} is damaged ({error}): {kind.remedy}") from None
     if table.get("format") != kind.format:
         raise OtherFormat(
-            f"the {kind.name} {path} has format {shown(table.get('format'))} but this version reads format {kind.format}: "
-            f"{kind.remedy}"
+            f"the {kind.name} {path} has format {shown(table.get('format'))} but this version reads format "
+            f"{kind.format}: {kind.remedy}"
         )
     if table.pop("seal", None) != _seal(table):
         raise Damaged(f"the {kind.name} {path} is damaged (its content differs from its checksum): {kind.remedy}")
