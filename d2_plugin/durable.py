@@ -143,9 +143,10 @@ def _write_new(path: Path, parts: tuple[bytes | memoryview, ...], synced: bool) 
 
 def refuse_inside_images(path: Path) -> None:
     """Refuse a place inside the images of a recording: a folder more would be a camera without a calibration."""
-    for folder in Path(os.path.realpath(path)).parents:
+    real = Path(os.path.realpath(path))
+    for folder in (real, *real.parents):
         if folder.name == "images" and (folder.parent / "cameras.json").is_file():
-            raise D2Error(f"{path} is inside {folder}, where every folder is a camera: give another --output")
+            raise D2Error(f"{path} is in {folder}, where every folder is a camera: give another --output")
 
 
 def refuse_foreign(path: Path, sign: str, command: str) -> None:

@@ -105,8 +105,9 @@ def check_splats(splats: Splats, count: int, inserting: bool) -> None:
         )
 
 
-def check_prior(prior: object, name: str) -> None:
-    """Refuse what a store gave and is no prior, and known pixels without a depth; `name` is what sentences call it."""
+def check_prior(prior: object, name: str) -> str:
+    """Refuse what a store gave and is no prior; returns what is wrong with its pixels, in a sentence that begins with
+    `name`, or nothing."""
     if not isinstance(prior, DepthPrior):
         raise D2Error(
             f"{name} is a {type(prior).__name__}, expected d2_plugin.protocol.DepthPrior or None: mend prior() of the "
@@ -119,12 +120,12 @@ def check_prior(prior: object, name: str) -> None:
         raise D2Error(f"{name} has maps of several sizes: give all of them {tuple(depth.shape)} as its depth")
     fits = (depth > 0) & (depth < torch.inf) | (labels == Label.EMPTY) | (labels == Label.CONFLICT)
     unknown = labels.byte() > max(Label)
-    if not bool(fits.all()) or bool(unknown.any()):
-        raise D2Error(
-            f"{name} has {int(unknown.sum())} labels that are none of 0 to {int(max(Label))}, and {int((~fits).sum())} "
-            "pixels whose label says that a depth is known and whose depth is NaN, infinite or not above 0: label "
-            f"these {int(Label.EMPTY)}"
-        )
+    if bool(fits.all()) and not bool(unknown.any()):
+        return ""
+    return (
+        f"{name} has {int(unknown.sum())} labels that are none of 0 to {int(max(Label))}, and {int((~fits).sum())} pixels "
+        "whose label says that a depth is known and whose depth is NaN, infinite or not above 0: none of them is used"
+    )
 
 
 def check_inserted(added: object, asked: int, grown: int) -> None:
@@ -168,14 +169,18 @@ class StepOrder:
     def __init__(self) -> None:
         self.done, self.begun = -1, -1
         """The last step that `D2Hooks.step` ended, and the last one that either of the two was given."""
+        self._warned = False
 
     def check(self, step: int, ends: bool) -> None:
-        """Refuse a number out of its order; `ends` says that it is `D2Hooks.step`'s."""
-        if step <= self.done or step < self.begun or (ends and self.done < self.begun != step):
-            raise D2Error(
-                f"d2.{'step' if ends else 'loss'} got step {step} after d2.loss or d2.step got {self.begun}: give both "
-                "the number of the optimizer's step, which rises from one to the next"
-            )
+        """Warn, once, of a number out of its order; `ends` says that it is `D2Hooks.step`'s."""
+        wrong = step <= self.done or step < self.begun or (ends and self.done < self.begun != step)
+        if wrong and not self._warned:
+            self._warned = True
+            _log.warning(
+                "d2.%s got step %d after d2.loss or d2.step got %d: give both the number of the optimizer's step, "
+                "which rises from one to the next, or schedules run at other steps",
+                "step" if ends else "loss", step, self.begun,
+            )  # fmt: skip
         self.begun = step
         self.done = step if ends else self.done
 

@@ -168,6 +168,7 @@ class PriorLoader:
         self._known: dict[tuple[str, int], KnownMaps] = {}
         self._cameras = CameraCheck()
         self._without: set[str] = set()
+        self._flawed: set[str] = set()
         self.images: dict[tuple[str, int], Tensor] = {}
         """Colours of the images that are trained on (`small_image`), until the prior of their view is read."""
         self.named = False
@@ -221,7 +222,10 @@ class PriorLoader:
         return sum(part.numel() * part.element_size() for part in tensors)
 
     def _check(self, view: View, prior: DepthPrior) -> None:
-        check_prior(prior, f"the prior of camera {view.camera}, frame {view.frame}")
+        flaw = check_prior(prior, f"the prior of camera {view.camera}, frame {view.frame}")
+        if flaw and view.camera not in self._flawed:
+            self._flawed.add(view.camera)
+            log.warning("%s", flaw)
         height, width = prior.depth.shape
         if (width, height) != (view.width, view.height):
             raise D2Error(

@@ -154,7 +154,7 @@ class TestSupervision:
 
 class TestLoader:
     def test_pixels_judge_where_sigma_is_small_whatever_their_label(self) -> None:
-        labels = torch.tensor([[Label.VERIFIED, Label.VERIFIED, Label.MONO, Label.FAR, Label.CONFLICT, Label.EMPTY]])
+        labels = torch.tensor([[Label.VERIFIED, Label.VERIFIED, Label.MONO, Label.FAR, Label.CONFLICT, Label.MONO]])
         sigma = torch.tensor([[0.0, 2 * JUDGES, JUDGES, 0.0, 0.0, 0.0]])
         depth = torch.tensor([[1.0, 1, 1, 1, 0, torch.nan]])
         loader, view = loader_of(DepthPrior(depth, labels.byte(), sigma=sigma))
@@ -179,7 +179,7 @@ class TestStiff:
         depth = torch.tensor([[1e-3, 1e6, 1e-3, 1e6, 1.0, 1.0, nan, inf, 1.0, 1e6]])
         sigma = torch.tensor([[0.0, 1e-4, 1.0, 0.0, 1e30, nan, 0.0, 0.0, 0.0, 0.0]])
         labels = torch.full((1, 10), int(Label.VERIFIED), dtype=torch.uint8)
-        labels[0, 9], labels[0, 6:8] = Label.FAR, Label.EMPTY
+        labels[0, 9] = Label.FAR
         pixels = known(DepthPrior(depth, labels, sigma=sigma))
         assert pixels.kind.flatten().nonzero().flatten().tolist() == [0, 1, 2, 3, 4, 8, 9]
         half = torch.tensor(0.5)

@@ -54,9 +54,6 @@ def verified(prior: DepthPrior, depth: float) -> DepthPrior:
     [
         (lambda prior: "x", "is a str, expected d2_plugin.protocol.DepthPrior or None"),
         (lambda prior: tuple(prior), "is a tuple, expected"),
-        *((lambda prior, depth=depth: verified(prior, depth), "1 pixels whose label says that a depth is known")
-          for depth in (float("nan"), float("inf"), -3.0, 0.0)),
-        (lambda prior: prior._replace(labels=torch.full_like(prior.labels, 9)), "768 labels that are none of 0 to 5"),
         (lambda prior: prior._replace(labels=prior.labels[1:]), "has maps of several sizes"),
         (lambda prior: prior._replace(sigma=prior.depth[1:]), "has maps of several sizes"),
         (lambda prior: prior._replace(depth=prior.depth.numpy()), "has no depth as a map"),
@@ -66,6 +63,23 @@ def verified(prior: DepthPrior, depth: float) -> DepthPrior:
 def test_a_prior_that_cannot_be_is_refused(change: Callable[[DepthPrior], object], says: str) -> None:
     with pytest.raises(D2Error, match=f"the prior of camera cam0, frame 0 .*{says}"):
         hooks(ChangedStore(change)).loss(1, VIEWS[0])
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        *((lambda prior, depth=depth: verified(prior, depth), "1 pixels whose label says that a depth is known")
+          for depth in (float("nan"), float("inf"), -3.0, 0.0)),
+        (lambda prior: prior._replace(labels=torch.full_like(prior.labels, 9)), "768 labels that are none of 0 to 5"),
+    ],
+)  # fmt: skip
+def test_pixels_of_a_prior_that_cannot_be_are_counted_once_per_camera(
+    change: Callable[[DepthPrior], object], says: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    d2 = hooks(ChangedStore(change))
+    for step in (1, 2):
+        d2.loss(step, [view for view in VIEWS if view.camera == "cam0"])
+    assert caplog.text.count(says) == 1
 
 
 @pytest.mark.parametrize("name", ["zeros", "mirrored", "scaled", "no last row", "K of zeros"])
@@ -85,13 +99,14 @@ def test_a_pose_that_cannot_be_is_refused(name: str) -> None:
         hooks().loss(1, replace(view, T_camera_world=pose, K=K))
 
 
-def test_a_step_that_falls_repeats_or_differs_is_refused() -> None:
+def test_a_step_that_falls_repeats_or_differs_is_named_once(caplog: pytest.LogCaptureFixture) -> None:
     def after(*calls: tuple[str, int]) -> None:
         d2 = hooks(config=D2Config(depth_loss=DepthLossConfig()))
         for name, step in calls:
             d2.loss(step, VIEWS[0]) if name == "loss" else d2.step(step)
 
     after(("loss", 1), ("loss", 1), ("step", 1), ("loss", 2), ("step", 2), ("step", 5), ("loss", 9))
+    assert "which rises" not in caplog.text
     for wrong in (
         [("loss", 5), ("step", 5), ("loss", 4)],
         [("loss", 5), ("step", 5), ("loss", 5)],
@@ -99,8 +114,9 @@ def test_a_step_that_falls_repeats_or_differs_is_refused() -> None:
         [("loss", 5), ("step", 6)],
         [("loss", 5), ("loss", 4)],
     ):
-        with pytest.raises(D2Error, match="which rises from one to the next"):
-            after(*wrong)
+        caplog.clear()
+        after(*wrong, *wrong)
+        assert caplog.text.count("which rises from one to the next") == 1
 
 
 class Lazy(Yang4DAdapter):
