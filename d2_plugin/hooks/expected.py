@@ -123,8 +123,8 @@ def check_prior(prior: object, name: str) -> str:
     if bool(fits.all()) and not bool(unknown.any()):
         return ""
     return (
-        f"{name} has {int(unknown.sum())} labels that are none of 0 to {int(max(Label))}, and {int((~fits).sum())} pixels "
-        "whose label says that a depth is known and whose depth is NaN, infinite or not above 0: none of them is used"
+        f"{name} has {int(unknown.sum())} labels that are none of 0 to {int(max(Label))}, and {int((~fits).sum())} "
+        "pixels whose label says that a depth is known and whose depth is NaN, infinite or not above 0: none is used"
     )
 
 
