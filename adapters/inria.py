@@ -124,6 +124,10 @@ class InriaAdapter(Resizing, ABC):
         path = optional(camera, "image_path")
         return None if path is None else str(path)
 
+    def image(self, camera: Any) -> Tensor | None:
+        """The image that a camera shows [3, H, W], where its object keeps it."""
+        return optional(camera.camera if isinstance(camera, RenderedCamera) else camera, "original_image")
+
     def begin_step(self, step: int) -> None:
         """Note the training step; renders of earlier steps are out of date and forgotten."""
         if step != self._step:

@@ -13,14 +13,14 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from d2_plugin.errors import D2Error
-from d2_plugin.settings import AtLeastOne, NotNegative, Settings
+from d2_plugin.settings import LearningRate, Range, Settings
 
 SPLITS = (3, 4, 3)
 """Columns of the last layer: offsets of position, quaternion and log-scales."""
@@ -52,11 +52,11 @@ plane of ones changes nothing. Official names: plane_tv_weight, time_smoothness_
 class MlpSettings(Settings):
     """Network of `MlpField`."""
 
-    width: AtLeastOne = 64
+    width: Annotated[int, Range(1, 8192)] = 64
     """Neurons of a hidden layer. Official: 256, on a GPU."""
-    depth: AtLeastOne = 4
+    depth: Annotated[int, Range(1, 64)] = 4
     """Hidden layers, with a skip connection to the middle one. Official: 8."""
-    rate: NotNegative = 2e-4
+    rate: LearningRate = 2e-4
     """Learning rate of the network at the first step. Official: 8e-4."""
 
 
@@ -64,13 +64,13 @@ class MlpSettings(Settings):
 class HexPlaneSettings(Settings):
     """Planes and network of `HexPlaneField`."""
 
-    features: AtLeastOne = 16
+    features: Annotated[int, Range(1, 256)] = 16
     """Channels of each plane."""
-    resolutions: tuple[AtLeastOne, ...] = (16, 32)
+    resolutions: tuple[Annotated[int, Range(1, 1024)], ...] = (16, 32)
     """Nodes of the planes along each axis of space, one number per level. Official: 64 and 128."""
-    instants: AtLeastOne = 10
+    instants: Annotated[int, Range(1, 10_000)] = 10
     """Nodes of the planes along time. Official: half the number of frames."""
-    network_rate: NotNegative = 3e-4
+    network_rate: LearningRate = 3e-4
     """Learning rate of the network at the first step."""
 
     def __post_init__(self) -> None:

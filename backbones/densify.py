@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Annotated, Protocol
 
 import torch
 from torch import Tensor
 
-from d2_plugin.settings import Count, Every, NotNegative, Settings, Share
+from d2_plugin.settings import Count, Every, Range, Settings, Share
 
 from .gaussians import Gaussians
 
@@ -48,7 +48,7 @@ class DensifySettings(Settings):
     """Share of the run after which there are no more edits."""
     every: Every = 100
     """Steps between edits."""
-    gradient: NotNegative = 1e-3
+    gradient: Annotated[float, Range(0, 1e6)] = 1e-3
     """Mean screen-space gradient (in units of half the image) above which a Gaussian is cloned or split. The official
     2e-4 overfits where there are few views."""
     budget: Count = 100_000

@@ -16,7 +16,7 @@ from d2_plugin.errors import D2Error
 from d2_plugin.gaussians import spherical_harmonics as sh
 from d2_plugin.gaussians.moving import Harmonics, MovingGaussians
 from d2_plugin.rasterizer import RasterSettings, Render, Splats, View, rasterize
-from d2_plugin.settings import NotNegative, Positive, Range, Settings
+from d2_plugin.settings import LearningRate, Range, Settings
 
 from .appearance import Appearance
 from .background import Background
@@ -44,11 +44,11 @@ class SplatSettings(Settings):
     """False leaves time out: these are ordinary 3D Gaussians."""
     sh_degree: Annotated[int, Range(0, 3)] = 0
     """Degree of the view-dependent colour."""
-    position_rate: Positive = 3e-4
+    position_rate: Annotated[float, Range(1e-9, 100)] = 3e-4
     """Learning rate of positions at the first step, times the extent of the scene."""
-    scale_rate: NotNegative = 1e-2
+    scale_rate: LearningRate = 1e-2
     """Learning rate of log-scales."""
-    opacity_rate: NotNegative = 5e-2
+    opacity_rate: LearningRate = 5e-2
     """Learning rate of opacity logits."""
     background: bool = True
     """Whether directions have a colour of their own at infinity, behind all Gaussians: for skies, and for what no

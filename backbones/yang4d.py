@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 from torch import Tensor
@@ -20,7 +20,7 @@ from d2_plugin.gaussians.native_slice import STATIC, TEMPORAL
 from d2_plugin.gaussians.rotation4d import rotation_matrices_3d, rotation_matrices_4d, unit_quaternions
 from d2_plugin.gaussians.slicing import slice_gaussians
 from d2_plugin.rasterizer import Splats, View
-from d2_plugin.settings import Count
+from d2_plugin.settings import Range
 
 from .model import INITIAL_OPACITY, ROTATION_RATE, SplatModel, SplatSettings, shared_rates
 from .starting import identity_quaternions, isotropic_rows, nearest_neighbour_scales, refuse_temporal
@@ -37,7 +37,7 @@ TIME_RATE = 1.6e-3
 class Yang4DSettings(SplatSettings):
     """Model and optimizer of the backbone."""
 
-    sh_time_degree: Count = 0
+    sh_time_degree: Annotated[int, Range(0, 8)] = 0
     """Number of cosines in time that modulate the colour; 0: constant in time."""
     couples_time: bool = True
     """False keeps time apart from space: one quaternion instead of two, and every Gaussian stands still while it lives

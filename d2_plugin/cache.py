@@ -25,10 +25,11 @@ class Untrusted(D2Error):
 
 def cache_folder() -> Path:
     """Where compiled libraries are kept (neither made nor looked at here)."""
-    if chosen := os.environ.get("D2_CACHE"):
-        return Path(chosen).expanduser()
-    base = os.environ.get("XDG_CACHE_HOME")
-    return (Path(base) if base else Path.home() / ".cache") / "d2-4dgs"
+    chosen, base = os.environ.get("D2_CACHE"), os.environ.get("XDG_CACHE_HOME") or "~/.cache"
+    try:
+        return Path(chosen).expanduser() if chosen else Path(base).expanduser() / "d2-4dgs"
+    except RuntimeError:  # a user that this machine does not know
+        raise D2Error(f"there is no home folder of {chosen or base}: set D2_CACHE to a folder of your own") from None
 
 
 def private_cache() -> Path:
@@ -48,6 +49,8 @@ def check_private(folder: Path) -> None:
     """Refuse a folder that others may write, or replace by writing above it; one that is not there is not refused."""
     if os.name == "nt" or not folder.exists():
         return
+    if not folder.is_dir():
+        raise Untrusted(f"the cache {folder} is no folder: set D2_CACHE to a folder of your own")
     real = folder.resolve()
     for place in (real, *real.parents):
         found = place.stat()

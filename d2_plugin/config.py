@@ -52,13 +52,13 @@ class D2Config(_HookTables):
     iterations: AtLeastOne | None = None
     """Length of the trainer's run: what the hooks' tables leave out of start, stop, every and budget follows from it.
     """
-    views_per_evaluation: AtLeastOne = 8
+    views_per_evaluation: Annotated[int, Range(1, 10_000)] = 8
     """Training views surveyed at each structure update, taken in turn over all cameras and frames; at the first one at
     least one of each camera seen so far."""
     retire_after: Count = 5
     """A structure hook retires after this many evaluations in a row that change next to nothing (less than a thousandth
     of the Gaussians); 0: never."""
-    remove_at_most: Annotated[float, Range(0, 1, open_low=True)] = 0.9
+    remove_at_most: Annotated[float, Range(1e-6, 1)] = 0.9
     """Largest share of the Gaussians that all hooks together remove in one step; what is more waits for the next
     evaluation, where it must be asked for again. 1 sets no limit, as the paper."""
     finite_every: Count = 100

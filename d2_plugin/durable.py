@@ -2,7 +2,7 @@
 
     write(path, ...)         under a temporary name, synchronised, renamed: a kill or a full disk leaves the old file
     write_table, read_table  a JSON object that names its format and carries a checksum of everything else in it
-    archive_problem          the same question for files that are zip archives (.npz, .pt): zip has its own checksums
+    write_archive, opened_archive  the same for files that are zip archives (.npz, .pt), in the comment of the archive
 
 Whatever the operating system refuses becomes one sentence that names the file, the reason and what to do.
 """
@@ -12,20 +12,24 @@ from __future__ import annotations
 import contextlib
 import errno
 import hashlib
+import io
 import json
 import os
 import secrets
 import stat
-import zipfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 from d2_plugin.errors import D2Error
 from d2_plugin.reading import MOST_TEXT, json_text, opened
+from d2_plugin.values import shown
 
 LEFTOVER = ".part"
 """How the temporary names end; what a killed process left behind is found by it."""
+
+ARCHIVE_SEAL = b"d2-4dgs sha256 "
+"""What stands before the checksum in the comment of an archive."""
 
 FULL = (errno.ENOSPC, errno.EDQUOT)
 FORBIDDEN = (errno.EROFS, errno.EACCES, errno.EPERM)
@@ -137,8 +141,17 @@ def _write_new(path: Path, parts: tuple[bytes | memoryview, ...], synced: bool) 
         os.close(descriptor)
 
 
+def refuse_inside_images(path: Path) -> None:
+    """Refuse a place inside the images of a recording: a folder more would be a camera without a calibration."""
+    real = Path(os.path.realpath(path))
+    for folder in (real, *real.parents):
+        if folder.name == "images" and (folder.parent / "cameras.json").is_file():
+            raise D2Error(f"{path} is in {folder}, where every folder is a camera: give another --output")
+
+
 def refuse_foreign(path: Path, sign: str, command: str) -> None:
     """Refuse to replace a file without the sign, among its first 1000 bytes, of the command that writes it."""
+    refuse_inside_images(path)
     if path.exists():
         with opened(path, "give another --output") as file:
             if sign.encode() not in file.read(1000):
@@ -189,8 +202,8 @@ def read_table(path: Path, kind: Kind) -> dict[str, Any]:
         raise Damaged(f"the {kind.name} {path} is damaged ({error}): {kind.remedy}") from None
     if table.get("format") != kind.format:
         raise OtherFormat(
-            f"the {kind.name} {path} has format {table.get('format')} but this version reads format {kind.format}: "
-            f"{kind.remedy}"
+            f"the {kind.name} {path} has format {shown(table.get('format'))} but this version reads format "
+            f"{kind.format}: {kind.remedy}"
         )
     if table.pop("seal", None) != _seal(table):
         raise Damaged(f"the {kind.name} {path} is damaged (its content differs from its checksum): {kind.remedy}")
@@ -210,18 +223,33 @@ def _seal(table: Mapping[str, Any]) -> str:
     return hashlib.sha256(plain.encode()).hexdigest()
 
 
-def archive_problem(path: Path) -> str:
-    """What is wrong with a zip archive (.npz, or what `torch.save` writes), or nothing: its checksums are compared.
+def write_archive(path: Path, content: io.BytesIO) -> None:
+    """Write a zip archive (of `torch.save` or `np.savez`) with SHA-256 of all its bytes in its comment.
 
-    The readers of numpy and torch compare them in part or not at all. What we write is not compressed, so a part that
-    says it is larger than its file is none of ours, and is not unpacked.
+    Every reader of zip skips a comment, so that torch and numpy open the file as it is.
     """
-    try:
-        refuse_no_file(path)
-        with zipfile.ZipFile(path) as archive:
-            if sum(part.file_size for part in archive.infolist()) > path.stat().st_size:
-                return "its parts say that they are larger than the file"
-            bad = archive.testzip()
-    except (OSError, ValueError, EOFError, NotImplementedError, RuntimeError, zipfile.BadZipFile) as error:
-        return str(error) or type(error).__name__
-    return "" if bad is None else f"the checksum of its part {bad} differs"
+    data = content.getbuffer()
+    data[-2:] = (len(ARCHIVE_SEAL) + 32).to_bytes(2, "little")  # length of the comment, last field of a bare archive
+    write(path, data, ARCHIVE_SEAL, hashlib.sha256(data).digest())
+
+
+@contextlib.contextmanager
+def opened_archive(path: Path, kind: str, remedy: str) -> Iterator[BinaryIO]:
+    """What `write_archive` wrote, open at its begin, once every byte was compared with the checksum.
+
+    zip's own checksums are of the contents alone: a flipped bit in its tables makes torch read memory that nobody
+    wrote.
+
+    Raises:
+        Damaged: it is not what was written; nothing but its bytes was looked at.
+    """
+    with opened(path, remedy) as file:
+        left = os.fstat(file.fileno()).st_size - len(ARCHIVE_SEAL) - 32
+        digest = hashlib.sha256()
+        while left > 0 and (block := file.read(min(left, 1 << 20))):
+            digest.update(block)
+            left -= len(block)
+        if file.read() != ARCHIVE_SEAL + digest.digest():
+            raise Damaged(f"the {kind} {path} is damaged (its content differs from its checksum): {remedy}")
+        file.seek(0)
+        yield file

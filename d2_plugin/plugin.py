@@ -7,12 +7,15 @@ d2.step(step)                                     # after optimizer.step() and z
 
 from __future__ import annotations
 
+import functools
 import logging
+import os
+import threading
 import warnings
 from collections import deque
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar, cast
 
 import torch
 from torch import Tensor
@@ -21,7 +24,17 @@ from d2_plugin.config import D2Config
 from d2_plugin.errors import D2Error
 from d2_plugin.hooks import HOOKS, Context, Hook, PriorLoader
 from d2_plugin.hooks.edits import Idle, followed, limited
-from d2_plugin.hooks.expected import check_backbone, check_state, check_step, converted, fitting_state
+from d2_plugin.hooks.expected import (
+    StepOrder,
+    check_backbone,
+    check_inserted,
+    check_state,
+    check_step,
+    check_surroundings,
+    converted,
+    fitting_state,
+    small_image,
+)
 from d2_plugin.hooks.finite import FiniteCheck
 from d2_plugin.hooks.prior import Store
 from d2_plugin.hooks.reports import OnReport, Report, RunLog, ScalarWriter, Trace
@@ -32,6 +45,27 @@ from d2_plugin.registry import ADAPTERS, load
 from d2_plugin.values import checked_arguments
 
 _log = logging.getLogger(__name__)
+
+if hasattr(os, "register_at_fork"):
+    # OpenMP's threads are not there after a fork, and a child that used them would wait for them for ever.
+    os.register_at_fork(after_in_child=functools.partial(torch.set_num_threads, 1))
+
+Method = TypeVar("Method", bound=Callable[..., Any])
+
+
+def _by_one_thread(method: Method) -> Method:
+    """Refuse a call while another thread is within one."""
+
+    @functools.wraps(method)
+    def alone(self: D2Hooks, *given: Any, **named: Any) -> Any:
+        if not self._used.acquire(blocking=False):
+            raise D2Error("two threads use one D2Hooks at once: call d2.loss and d2.step from the thread that trains")
+        try:
+            return method(self, *given, **named)
+        finally:
+            self._used.release()
+
+    return cast(Method, alone)
 
 
 class D2Hooks:
@@ -57,6 +91,7 @@ class D2Hooks:
         self.generator = torch.Generator().manual_seed(config.seed)
         self._sampler = ViewSampler()
         self._finite = FiniteCheck(backbone, config.finite_every)
+        self._order, self._used = StepOrder(), threading.Lock()
         self._evaluated = False
         self._count = len(backbone)
         self._warned = False
@@ -141,6 +176,7 @@ class D2Hooks:
         """Hooks that stopped because their last evaluations changed next to nothing, and the step of the last one."""
         return self._idle.retired
 
+    @_by_one_thread
     def loss(self, step: int, views: object) -> Tensor | float:
         """The hooks' share of this step's loss: a scalar on the backbone's device, or 0.0 when there is none.
 
@@ -153,10 +189,12 @@ class D2Hooks:
         if batch and not self.prior.named:
             self.prior.name_by(call_optional(self.backbone, "image_name", batch[0]))
         shown = [converted(self.backbone, camera) for camera in batch]
-        self._sampler.add(shown)
+        for camera, view in zip(batch, shown):
+            if self._sampler.add(view) and (image := small_image(self.backbone, camera)) is not None:
+                self.prior.images[view.camera, view.frame] = image
         context = self._context(step, shown)
         total: Tensor | float = 0.0
-        for name, hook in self._due(step):
+        for name, hook in self._due(step, ends=False):
             term = hook.loss(context)
             if term is not None:
                 self.trace.append(Trace(step, name, "loss", 0))
@@ -174,13 +212,14 @@ class D2Hooks:
             ]
             self.prior.prefetch(key for key in known if key is not None)
 
+    @_by_one_thread
     @torch.no_grad()
     def step(self, step: int) -> Report:
         """Insert and remove what the hooks ask for, in one edit; call after the optimizer's step and zero_grad."""
         if not self.hooks:
             return Report(gaussians=len(self.backbone), step=step)
         self._begin(step)
-        due = self._due(step)
+        due = self._due(step, ends=True)
         self._finite.check(step, any(name in HOOKS and HOOKS[name].edits_structure for name, _ in due))
         context = self._context(step, ())
         proposals = [(name, hook.edit(context)) for name, hook in due]
@@ -215,6 +254,7 @@ class D2Hooks:
             self._sampler.load_state_dict(state["views"])
             self.generator.set_state(state["generator"].cpu())
             self._idle.load(state)
+        self._order = StepOrder()
         self._evaluated = bool(state.get("evaluated", True))
         self._count = len(self.backbone)
         self._finite.step = self._finite.saved = state.get("step", 0)
@@ -223,12 +263,14 @@ class D2Hooks:
     def _begin(self, step: int) -> None:
         """Give the backbone the number of the step, and notice changes that nobody reported."""
         check_step(step)
+        check_surroundings()
         call_optional(self.backbone, "begin_step", step)
         self._check_count()
 
-    def _due(self, step: int) -> list[tuple[str, Hook]]:
+    def _due(self, step: int, ends: bool) -> list[tuple[str, Hook]]:
         if not call_optional(self.backbone, "active", step, default=True):
-            return []
+            return []  # in its other stages a trainer may count anew
+        self._order.check(step, ends)
         return [(name, hook) for name, hook in self.hooks.items() if name not in self.retired and hook.window.due(step)]
 
     def _context(self, step: int, views: Sequence) -> Context:
@@ -261,12 +303,13 @@ class D2Hooks:
         proposals = [(name, edit.insert) for name, edit in edits if edit.insert is not None]
         if not proposals:
             return 0
-        points = Points.joined([points for _, points in proposals])
+        points, before = Points.joined([points for _, points in proposals]), len(self.backbone)
         self._inserting = step
         try:
             inserted = self.backbone.insert(points)
         finally:
             self._inserting = 0
+        check_inserted(inserted, len(points.positions), len(self.backbone) - before)
         self.trace.append(Trace(step, proposals[0][0], "insert", inserted))
         return inserted
 

@@ -166,17 +166,17 @@ class CameraRecord(NamedTuple):
 class RasterSettings(Settings):
     """Constants of splatting, by default the Inria rasterizer's."""
 
-    near: Annotated[float, Range(0, unit="world units", open_low=True)] = 0.2
+    near: Annotated[float, Range(1e-9, unit="world units")] = 0.2
     """Gaussians with a view depth z <= near are not drawn."""
-    blur: Annotated[float, Range(0, unit="pixels squared")] = 0.3
+    blur: Annotated[float, Range(0, 1e6, unit="pixels squared")] = 0.3
     """Added to both diagonal entries of the projected covariance."""
-    alpha_max: Annotated[float, Range(0, 1, open_low=True, open_high=True)] = 0.99
+    alpha_max: Annotated[float, Range(1e-6, 1, open_high=True)] = 0.99
     """Upper clamp of alpha; no gradient flows through a clamped alpha."""
     alpha_min: Share = 1 / 255
     """Contributions with a smaller alpha are skipped."""
     transmittance_min: Share = 1e-4
     """A pixel is finished before the Gaussian that would bring its transmittance to this value or below."""
-    fov_clamp: Annotated[float, Range(0, open_low=True, infinite=True)] = 1.3
+    fov_clamp: Annotated[float, Range(1e-3, 1e6, infinite=True)] = 1.3
     """x/z and y/z are clamped to this multiple of tan(fov/2) in the projection's Jacobian."""
     antialiased: bool = False
     """Whether what the blur spreads is taken off the opacity (the 2D filter of Mip-Splatting, Yu et al. 2024): a
@@ -227,6 +227,8 @@ class Backbone(Protocol):
         path of the image of a trainer's camera; priors of an exported recording are found by it.
     ``prior_key(camera) -> (camera, frame)``
         the key of the prior of a trainer's camera, without its view: what comes next is read ahead by it.
+    ``image(camera) -> Tensor | None``
+        RGB [3, H, W] in 0..1 of a trainer's camera: asked for once per view, and held against the prior's colours.
     ``active(step) -> bool``
         False while the hooks must wait (stages, warm-up); changes nothing.
     ``colors(view, splats) -> Tensor``

@@ -10,7 +10,9 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
 import stat
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -25,6 +27,12 @@ MOST_BYTES = 1 << 31
 
 MOST_TEXT = 1 << 28
 """Larger texts are refused: their parsed values take up to some thirty times as much memory."""
+
+MOST_SLOW = 1 << 20
+"""Longer TOML and YAML is refused: a second of parsing for every few hundred kilobytes."""
+
+DEEPEST = 64
+"""Of tables within each other in TOML and YAML."""
 
 MOST_DIGITS = 300
 """Longer whole numbers are refused: they fit no float."""
@@ -117,16 +125,28 @@ def parse_json(text: str, place: str, remedy: str = RESTORE) -> Any:
 
 def read_toml(path: Path | str, remedy: str = RESTORE) -> dict[str, Any]:
     """The tables of a TOML file."""
-    text = read_text(path, remedy)
+    return parse_toml(read_text(path, remedy), shown_path(path), remedy)
+
+
+def parse_toml(text: str, place: str, remedy: str = RESTORE) -> dict[str, Any]:
+    """The tables of a TOML text; `place` names the file in errors."""
+    check_slow(text, place, remedy)
     try:
+        if any(part.count(".") > DEEPEST for part in re.split(r"[=,{\n]", text)):  # its time grows with the square
+            raise RecursionError
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as failure:
-        raise Unreadable(f"{shown_path(path)} is not valid TOML ({said(failure)}): {remedy}") from None
+        raise Unreadable(f"{place} is not valid TOML ({said(failure)}): {remedy}") from None
     except RecursionError:
-        raise Unreadable(f"{shown_path(path)} is TOML nested too deeply: {remedy}") from None
+        raise Unreadable(f"{place} is TOML nested too deeply: {remedy}") from None
     except (ValueError, OverflowError) as failure:  # digits without end, days that no calendar has
-        reason = f"has a value that TOML does not know ({said(failure)})"
-        raise Unreadable(f"{shown_path(path)} {reason}: {remedy}") from None
+        raise Unreadable(f"{place} has a value that TOML does not know ({said(failure)}): {remedy}") from None
+
+
+def check_slow(text: str, place: str, remedy: str) -> None:
+    """Refuse a text that parsers written in Python would take minutes for."""
+    if len(text) > MOST_SLOW:
+        raise Unreadable(f"{place} has more than {MOST_SLOW} letters, the most that is read of its kind: {remedy}")
 
 
 def json_text(values: Any, place: str, **layout: Any) -> str:
@@ -232,8 +252,7 @@ def _whole(text: str) -> int:
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     table = dict(pairs)
     if len(table) < len(pairs):
-        names = [name for name, _ in pairs]
-        twice = next(name for name in names if names.count(name) > 1)
+        twice = Counter(name for name, _ in pairs).most_common(1)[0][0]
         raise ValueError(f"the name {twice[:40]!r} stands twice in one object")
     return table
 

@@ -23,9 +23,9 @@ from typing import Annotated, Any, NamedTuple, TypeVar, cast, get_args
 
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.older import hints_of
+from d2_plugin.values import UNBOUNDED, bare_and_range, options_of, shown
 from d2_plugin.values import OutOfRange as OutOfRange
 from d2_plugin.values import Range as Range
-from d2_plugin.values import bare_and_range, options_of, shown
 from d2_plugin.values import checked as checked
 
 
@@ -35,21 +35,27 @@ class Positional:
 
 
 Count = Annotated[int, Range(0)]
-"""A whole number, 0 or more."""
+"""A whole number, 0 or more (and `d2_plugin.values.MOST` at most, as every number that declares no other bound)."""
 Steps = Annotated[int, Range(0, unit="steps")]
 """Optimizer steps, 0 or more."""
 Every = Annotated[int, Range(1, unit="steps")]
 """Optimizer steps from one time to the next, 1 or more."""
 AtLeastOne = Annotated[int, Range(1)]
 """A whole number, 1 or more."""
+Downscale = Annotated[int, Range(1, 65_535)]
+"""How many times smaller an image becomes along each side."""
 AtATime = Annotated[int, Range(1, 1024)]
 """How many threads or processes work at a time, 1 or more."""
 Seed = Annotated[int, Range(0, 2**63 - 1)]
 """Seed of a random generator."""
-Positive = Annotated[float, Range(0, open_low=True)]
+Positive = Annotated[float, Range(1e-9)]
 """A number above 0."""
 NotNegative = Annotated[float, Range(0)]
 """A number, 0 or more."""
+LearningRate = Annotated[float, Range(0, 100)]
+"""Learning rate per step."""
+Relative = Annotated[float, Range(0, 1e6)]
+"""A difference relative to what it is a difference of, 0 or more."""
 Share = Annotated[float, Range(0, 1)]
 """A part of a whole, 0..1."""
 Angle = Annotated[float, Range(0, 180, unit="degrees")]
@@ -139,7 +145,7 @@ def _declared(kind: Any) -> tuple[Declared, ...]:
         default = entry.default if entry.default_factory is MISSING else entry.default_factory()
         bare, limits = bare_and_range(hints[entry.name])
         by_place = any(isinstance(extra, Positional) for extra in get_args(hints[entry.name])[1:])
-        found.append(Declared(entry.name, bare, default, limits, by_place, kind))
+        found.append(Declared(entry.name, bare, default, Range() if limits == UNBOUNDED else limits, by_place, kind))
     return tuple(found)
 
 

@@ -7,15 +7,18 @@ import inspect
 import math
 import types
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, is_dataclass, replace
+from dataclasses import dataclass, is_dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, Union, cast, get_args, get_origin
 
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.older import hints_of
 
-FAR = (1e4, 1e15)
-"""An upper bound within these is named only where it was crossed."""
+MOST = 1e9
+"""A declared number that says no bound is of at most this size."""
+
+FAR, TINY = 1e4, 1e-6
+"""A bound of at least this size, and one above 0 of at most this, is named only where it was crossed."""
 
 LISTS = (Iterable, Sequence, Collection)
 """Annotations of arguments that any iterable fits."""
@@ -26,10 +29,10 @@ UNIONS = (Union, getattr(types, "UnionType", Union))
 
 @dataclass(frozen=True)
 class Range:
-    """Where a number may lie, and its unit; bounds that are None do not bound. Infinity is refused unless allowed."""
+    """Where a number may lie, and its unit. Infinity is refused unless allowed."""
 
-    low: float | None = None
-    high: float | None = None
+    low: float = -MOST
+    high: float = MOST
     unit: str = ""
     open_low: bool = False
     """The lower bound itself is refused."""
@@ -42,13 +45,22 @@ class Range:
         """Whether `value`, whole or not, lies inside; NaN never does."""
         if isinstance(value, float) and (math.isnan(value) or (math.isinf(value) and not self.infinite)):
             return False
-        above = self.low is None or value > self.low or (value == self.low and not self.open_low)
-        return above and (self.high is None or value < self.high or (value == self.high and not self.open_high))
+        above = value > self.low or (value == self.low and not self.open_low)
+        below = value < self.high or (value == self.high and not self.open_high)
+        return (above and below) or (self.infinite and value == math.inf)
 
-    def __str__(self) -> str:
-        low = "" if self.low is None else f"{'above' if self.open_low else 'at least'} {self.low:g}"
-        high = "" if self.high is None else f"{'below' if self.open_high else 'at most'} {self.high:g}"
-        return " and ".join(part for part in (low, high) if part) or "finite"
+    def described(self, value: float = 0) -> str:
+        """The bounds in words; those far away only where `value` crossed them."""
+        low = f"{'above' if self.open_low else 'at least'} {self.low:g}"
+        if 0 < self.low <= TINY and not 0 < value < self.low:
+            low = "above 0"
+        high = f"{'below' if self.open_high else 'at most'} {self.high:g}"
+        near = (low, self.low > -FAR or value < self.low), (high, self.high < FAR or value > self.high)
+        return " and ".join(bound for bound, named in near if named) or "finite"
+
+
+UNBOUNDED = Range(-math.inf, math.inf)
+"""Of a number in a file or an argument that declares no range; among settings it is `Range()`."""
 
 
 class OutOfRange(D2Error):
@@ -113,7 +125,7 @@ def _as_kind(kind: Any, limits: Range, value: Any, name: str) -> Any:
         raise _wrong(name, f"must be {_noun(kind)}", value)
     if isinstance(value, Mapping) and len(get_args(kind)) == 2:
         for key, one in value.items():
-            _checked(*_inner(get_args(kind)[1], Range()), one, f"{shown(key)} in {name}")
+            _checked(*_inner(get_args(kind)[1], UNBOUNDED), one, f"{shown(key)} in {name}")
     return value
 
 
@@ -140,9 +152,7 @@ def _as_number(kind: type, limits: Range, value: Any, name: str) -> int | float:
         raise OutOfRange(str(_wrong(name, "must be a number below 1.8e308 in size", value))) from None
     if not limits.holds(number):
         unit = f" {limits.unit}" if limits.unit else ""
-        if limits.high is not None and FAR[0] <= limits.high <= FAR[1] and number <= limits.high:
-            limits = replace(limits, high=None)  # a bound far away is not worth a word
-        raise OutOfRange(str(_wrong(name, f"must be {limits}{unit}", value)))
+        raise OutOfRange(str(_wrong(name, f"must be {limits.described(number)}{unit}", value)))
     return number
 
 
@@ -193,15 +203,15 @@ def _kinds_of(function: Any) -> dict[str, Any]:
 def _inner(kind: Any, limits: Range) -> tuple[Any, Range]:
     """A kind inside a union or tuple, and its range: its own, else that of the whole."""
     bare, own = bare_and_range(kind)
-    return bare, own if own != Range() else limits
+    return bare, own if own != UNBOUNDED else limits
 
 
 def bare_and_range(hint: Any) -> tuple[Any, Range]:
     """The bare type of an annotation and its range."""
     if get_origin(hint) is Annotated:
         bare, *extras = get_args(hint)
-        return bare, next((extra for extra in extras if isinstance(extra, Range)), Range())
-    return hint, Range()
+        return bare, next((extra for extra in extras if isinstance(extra, Range)), UNBOUNDED)
+    return hint, UNBOUNDED
 
 
 def _noun(kind: Any) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import random
 import resource
 import time
@@ -25,6 +26,9 @@ ODD_TEXTS = (
     *("{", "}", "]", '"', "\\", "é", "\ufeff", "!!", "&a", "*a", "<<", "9" * 400, "1e-400", "true", "\n", "\t", " "),
 )
 """What takes the place of a piece of text."""
+
+SEED = int(os.environ.get("FUZZ_SEED", "1"))
+"""Of the slow rounds: another number draws another set."""
 
 MOST_SECONDS = 60.0
 """No single mutation may take longer, on a machine that others use as well: a video decoder tries hard."""

@@ -28,6 +28,7 @@ files that are kept, and locks."""
 ROOMS = {
     "ground": "ground",
     "__init__": "ground (plugin) (config)",
+    "__main__": "(commands)",
     "rasterizer": "ground",
     "gaussians": "ground rasterizer",
     "recordings": "ground",

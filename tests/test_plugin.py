@@ -171,7 +171,8 @@ def test_a_backbone_that_changes_silently_is_noticed_once() -> None:
 
 def test_evaluations_visit_every_view_before_any_twice() -> None:
     sampler, generator = ViewSampler(), torch.Generator().manual_seed(0)
-    sampler.add(make_views())
+    for view in make_views():
+        sampler.add(view)
     keys = [(v.camera, v.frame) for _ in range(2) for v in sampler.sample(3, generator)]
     assert len(set(keys)) == 6
     assert ViewSampler().sample(3, generator) == []

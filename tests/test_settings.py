@@ -38,7 +38,7 @@ from d2_plugin.settings import (
     declared,
     table_of,
 )
-from d2_plugin.values import bare_and_range
+from d2_plugin.values import UNBOUNDED, bare_and_range
 
 
 @dataclass(frozen=True)
@@ -121,7 +121,7 @@ def test_any_value_is_refused_in_one_sentence_with_its_name_or_kept_and_python_i
     kept = getattr(made, name)
     assert Example(**{name: kept}) == made
     for number in kept if isinstance(kept, tuple) else (kept,):
-        limits = Range(1) if name == "levels" else Range(0, open_low=True) if name == "bounds" else NAMES[name].range
+        limits = Range(1) if name == "levels" else Range(1e-9) if name == "bounds" else NAMES[name].range
         assert not isinstance(number, (int, float)) or isinstance(number, bool) or limits.holds(number)
 
 
@@ -130,7 +130,7 @@ def test_any_value_is_refused_in_one_sentence_with_its_name_or_kept_and_python_i
         Example,
         start=st.integers(0, 10**6),
         kind=st.sampled_from(["relative", "metric"]),
-        weight=st.floats(1e-300, 1e300),
+        weight=st.floats(1e-9, 1e9),
         stop=st.none() | st.integers(0, 9),
         tau=st.just("auto") | st.floats(1e-9, 1e9),
         levels=st.lists(st.integers(1, 99), max_size=4),
@@ -217,7 +217,7 @@ def every_settings_class() -> list[type[Settings]]:
 def numbers_in(kind: Any, limits: Range) -> Iterator[tuple[Any, Range]]:
     """The numbers that a declared kind holds, with the range of each."""
     bare, own = bare_and_range(kind)
-    limits = limits if own == Range() else own
+    limits = limits if own == UNBOUNDED else own
     if bare in (int, float):
         yield bare, limits
     if get_origin(bare) is not Literal:
@@ -225,15 +225,15 @@ def numbers_in(kind: Any, limits: Range) -> Iterator[tuple[Any, Range]]:
             yield from numbers_in(inner, limits)
 
 
-def test_every_number_among_the_settings_has_a_range() -> None:
+def test_every_number_among_the_settings_has_both_bounds() -> None:
     classes = every_settings_class()
     assert len(classes) > 20
     without = [
         f"{kind.__module__}.{kind.__name__}.{setting.name}"
         for kind in classes
         for setting in declared(kind)
-        for _, limits in numbers_in(setting.kind, setting.range)
-        if limits.low is None
+        for number, limits in numbers_in(setting.kind, setting.range)
+        if limits.holds(number(10**25)) or limits.holds(number(-(10**25))) or (limits.low and limits.holds(1e-320))
     ]
     assert without == []
 

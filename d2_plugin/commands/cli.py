@@ -108,7 +108,3 @@ def _about(command: str | ModuleCommand) -> str:
 
 def _module(name: str) -> ModuleType:
     return importlib.import_module(f"d2_plugin.commands.{name}")
-
-
-if __name__ == "__main__":
-    sys.exit(main())

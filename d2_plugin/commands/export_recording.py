@@ -11,7 +11,7 @@ from d2_plugin.recordings import Recording, open_recording, select_cameras
 from d2_plugin.recordings.export.export import export_recording
 from d2_plugin.recordings.export.ply import PointCloud
 from d2_plugin.runs.start import MIN_POINTS, initial_points, scene_extent, triangulated_points
-from d2_plugin.settings import Count, Positional, Range, Seed, Settings
+from d2_plugin.settings import Count, Downscale, Positional, Range, Seed, Settings
 
 
 @dataclass(frozen=True)
@@ -30,9 +30,9 @@ class RecordingExport(Settings):
     """Names of the cameras that are held out, joined by commas."""
     frames: tuple[Count, ...] | None = None
     """first:last or first:last:step, the last one included; if left out, all frames."""
-    downscale: Annotated[int, Range(1)] = 1
+    downscale: Downscale = 1
     """Make images this many times smaller along each side."""
-    points: Count = MIN_POINTS
+    points: Annotated[int, Range(0, 10_000_000)] = MIN_POINTS
     """Least number of initial points; 0 writes none."""
     seed: Seed = 0
     """Seed of the random points among them."""

@@ -51,8 +51,11 @@ def run(given: Given) -> str:
     """Train to the end and score; returns the table of scores."""
     from d2_plugin.runs.run import Run
     from d2_plugin.runs.tables import metrics_table
+    from d2_plugin.store.store import PriorStore
 
     options = given.make(TrainOptions)
+    if given.values["priors"] is not None:
+        PriorStore.described(Path(given.values["priors"]))  # nothing is built under a name that was mistyped
     given = _imported(given, options)
     run = Run(run_settings(given), options.output)
     show_notes(run.scene.recording.notes)

@@ -50,21 +50,21 @@ class DensifyConfig(HookConfig):
     """Steps between evaluations."""
     tau_v: Share = 0.5
     """A rendered depth is valid where the accumulated alpha exceeds this."""
-    tau_u: Positive = 0.1
+    tau_u: Annotated[float, Range(1e-6, 1e6)] = 0.1
     """Relative depth error above which a pixel counts as under-reconstructed, where its depth is that exact; 2.5 of its
     standard deviations where it is less exact."""
-    tau_u_mono: Annotated[float, Range(0, infinite=True)] = 0.2
+    tau_u_mono: Annotated[float, Range(0, 1e6, infinite=True)] = 0.2
     """The threshold of pixels without a finite sigma: they may propose and no more."""
-    spacing: Annotated[float, Range(1, unit="pixels")] = 4.0
+    spacing: Annotated[float, Range(1, 65_535, unit="pixels")] = 4.0
     """Distance between samples: one new Gaussian per square of this side where a surface is missing. The first
     evaluation so covers what the prior knows; later ones repair."""
     budget_per_view: Count = 20_000
     """No more samples than this in one view and evaluation: they lie further apart instead."""
     max_gaussians: Count = 1_000_000
     """No insertion beyond this number of Gaussians."""
-    scale: Positive = 0.7
+    scale: Annotated[float, Range(1e-3, 1000)] = 0.7
     """Standard deviation of a new Gaussian, which is round, in units of the distance between samples."""
-    opacity: Annotated[float, Range(0, 1, open_low=True)] = 0.1
+    opacity: Annotated[float, Range(1e-6, 1)] = 0.1
     """Opacity of a new Gaussian. A faint one cannot spoil what stands; training makes it opaque where it is right."""
     lifetime: Positive | None = 1.0
     """Standard deviation in time of a new Gaussian where the image moves, in intervals from instant to instant, in a

@@ -21,7 +21,7 @@ from d2_plugin.hooks.prior import FAR, NEAR, KnownMaps
 from d2_plugin.hooks.rendered_depth import EPSILON, rendered_depth
 from d2_plugin.protocol import View, call_optional
 from d2_plugin.rasterizer import rasterize
-from d2_plugin.settings import Every, Positive, Range, Share, Steps
+from d2_plugin.settings import Every, Range, Share, Steps
 
 
 @dataclass(frozen=True)
@@ -39,11 +39,11 @@ class DepthLossConfig(HookConfig):
     opaque: Annotated[float, Range(0, 1e6)] = 0.05
     """Beside lambda_d's 1, the weight of what known near pixels let through, mean of 1 - alpha; the paper has none. A
     background of the same colour could else stand for a surface."""
-    epsilon: Positive = 0.01
+    epsilon: Annotated[float, Range(1e-6, 1e6)] = 0.01
     """epsilon_rho of the Charbonnier penalty, on relative depth residuals."""
     tau_v: Share = 0.5
     """Pixels whose accumulated alpha does not exceed this are left out."""
-    sigma_full: Positive = 0.05
+    sigma_full: Annotated[float, Range(1e-6, 1e6)] = 0.05
     """Relative standard deviation up to which a pixel counts in full; beyond it, in proportion to sigma_full / sigma.
     """
 

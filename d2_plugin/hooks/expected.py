@@ -2,21 +2,34 @@
 
 from __future__ import annotations
 
+import logging
 import operator
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from d2_plugin.errors import D2Error
-from d2_plugin.protocol import Backbone, Splats, View
+from d2_plugin.protocol import Backbone, DepthPrior, Label, Splats, View, call_optional
 from d2_plugin.reading import said
 from d2_plugin.values import shown
 
+_log = logging.getLogger(__name__)
+
 MEMBERS = ("settings", "__len__", "view", "slice_at", "insert", "remove", "on_resize")
 """What every backbone has (see `d2_plugin.protocol.Backbone`)."""
+
+SKEWED = 0.01
+"""Largest entry of R R^T - 1 of a pose: float32 and calibrations in text stay far below."""
+
+BLOCK = 8
+"""Side in pixels of the blocks over which the colours of two images are averaged before they are compared."""
+OTHER_COLOR, OTHER_BLOCKS = 0.1, 0.01
+"""Two images show different instants where colours (0..1) differ by more than the one in more than the other of the
+blocks, less what they differ by in the median: compression, resizing and exposure stay below, what moves does not."""
 
 STATE = ("hooks", "views", "generator", "idle", "retired")
 """What `D2Hooks.state_dict` gives."""
@@ -68,6 +81,13 @@ def check_view(view: View) -> None:
         raise D2Error(f"{name} has focal lengths {fx:g} and {fy:g}, expected positive pixels: correct the camera")
     if not (view.width >= 1 and view.height >= 1):
         raise D2Error(f"{name} has {view.width}x{view.height} pixels, expected at least one: correct the camera")
+    rotation, last = T[:3, :3].detach().double().cpu(), [*K[2].tolist(), *T[3].tolist()]
+    skewed = float((rotation @ rotation.T - torch.eye(3, dtype=torch.float64, device="cpu")).abs().max())
+    if skewed > SKEWED or float(torch.linalg.det(rotation)) < 0 or last != [0, 0, 1, 0, 0, 0, 1]:
+        raise D2Error(
+            f"T_camera_world of {name} is no rotation and shift, or the last row of it or K is not 0 ... 0 1: correct "
+            "the camera"
+        )
 
 
 def check_splats(splats: Splats, count: int, inserting: bool) -> None:
@@ -91,6 +111,96 @@ def check_device(splats: Splats, view: View) -> None:
         raise D2Error(
             f"the view of camera {shown(view.camera)} at frame {shown(view.frame)} is on {view.K.device} but "
             f"slice_at() returned Gaussians on {splats.means.device}: make view() return K and T_camera_world there"
+        )
+
+
+def check_prior(prior: object, name: str) -> str:
+    """Refuse what a store gave and is no prior; returns what is wrong with its pixels, in a sentence that begins with
+    `name`, or nothing."""
+    if not isinstance(prior, DepthPrior):
+        raise D2Error(
+            f"{name} is a {type(prior).__name__}, expected d2_plugin.protocol.DepthPrior or None: mend prior() of the "
+            "store"
+        )
+    depth, labels, *others = prior
+    if not (isinstance(depth, Tensor) and isinstance(labels, Tensor) and depth.ndim == 2 and depth.is_floating_point()):
+        raise D2Error(f"{name} has no depth as a map [H, W] of floating-point numbers: give tensors")
+    if any(part is not None and part.shape[:2] != depth.shape for part in (labels, *others)):
+        raise D2Error(f"{name} has maps of several sizes: give all of them {tuple(depth.shape)} as its depth")
+    fits = (depth > 0) & (depth < torch.inf) | (labels == Label.EMPTY) | (labels == Label.CONFLICT)
+    unknown = labels.byte() > max(Label)
+    if bool(fits.all()) and not bool(unknown.any()):
+        return ""
+    return (
+        f"{name} has {int(unknown.sum())} labels that are none of 0 to {int(max(Label))}, and {int((~fits).sum())} "
+        "pixels whose label says that a depth is known and whose depth is NaN, infinite or not above 0: none is used"
+    )
+
+
+def check_inserted(added: object, asked: int, grown: int) -> None:
+    """Refuse what `insert` returned where the number of Gaussians did not grow by it; warn where that is none."""
+    if isinstance(added, bool) or not isinstance(added, int) or added != grown or not 0 <= added <= asked:
+        raise D2Error(
+            f"insert() was given {asked} points and returned {shown(added)}, and the backbone has {grown} Gaussians "
+            "more: return how many were added"
+        )
+    if asked and not added:
+        _log.warning("insert() of the backbone added none of %d points: densify had no effect in this step", asked)
+
+
+def small_image(backbone: Backbone, camera: object) -> Tensor | None:
+    """The colours of the image that a camera shows [3, h, w], averaged over blocks; None where nobody knows them."""
+    image = call_optional(backbone, "image", camera)
+    return None if image is None or image.ndim != 3 else _blocks(image)
+
+
+def check_colors(view: View, image: Tensor, colors: Tensor) -> None:
+    """Warn where a prior's colours [H, W, 3] are not those of the image (`small_image`) that is trained on."""
+    apart = image.cpu() - _blocks(colors.permute(2, 0, 1).float().cpu() / 255)
+    apart = (apart - apart.flatten(1).median(1).values[:, None, None]).abs()
+    share = float((apart.amax(0) > OTHER_COLOR).float().mean())
+    if share > OTHER_BLOCKS:
+        _log.warning(
+            "the prior of camera %s, frame %d was made for an image whose colours differ from those of the trained one "
+            "in %.0f %% of its area: does the key name another frame?", view.camera, view.frame, 100 * share,
+        )  # fmt: skip
+
+
+def _blocks(image: Tensor) -> Tensor:
+    """Means of an image [3, H, W] over blocks, those at the rim smaller."""
+    return F.avg_pool2d(image.detach().float()[None], BLOCK, ceil_mode=True)[0]
+
+
+class StepOrder:
+    """Step numbers rise from one `D2Hooks.step` to the next, and those of `loss` are the number of the step they are
+    of."""
+
+    def __init__(self) -> None:
+        self.done, self.begun = -1, -1
+        """The last step that `D2Hooks.step` ended, and the last one that either of the two was given."""
+        self._warned = False
+
+    def check(self, step: int, ends: bool) -> None:
+        """Warn, once, of a number out of its order; `ends` says that it is `D2Hooks.step`'s."""
+        wrong = step <= self.done or step < self.begun or (ends and self.done < self.begun != step)
+        if wrong and not self._warned:
+            self._warned = True
+            _log.warning(
+                "d2.%s got step %d after d2.loss or d2.step got %d: give both the number of the optimizer's step, "
+                "which rises from one to the next, or schedules run at other steps",
+                "step" if ends else "loss", step, self.begun,
+            )  # fmt: skip
+        self.begun = step
+        self.done = step if ends else self.done
+
+
+def check_surroundings() -> None:
+    """Refuse what torch was told to do to every tensor that is made, and D2 cannot work with."""
+    made = torch.empty(0)
+    if made.dtype != torch.float32 or made.device.type == "meta" or torch.is_inference_mode_enabled():
+        raise D2Error(
+            f"torch makes {made.dtype} on {made.device}{' in inference mode' if made.is_inference() else ''}: D2 needs "
+            "float32 as the default dtype, a device with memory, and no inference mode"
         )
 
 

@@ -14,6 +14,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from d2_plugin.errors import D2Error
+from d2_plugin.hooks.expected import check_colors, check_prior
 from d2_plugin.protocol import CameraRecord, DepthPrior, Label, View
 from d2_plugin.store.maps import UNKNOWN, CodedPrior
 
@@ -224,6 +225,9 @@ class PriorLoader:
         self._checked: set[Key] = set()
         self._pin = self._dropped = False
         self._without: set[str] = set()
+        self._flawed: set[str] = set()
+        self.images: dict[tuple[str, int], Tensor] = {}
+        """Colours of the images that are trained on (`small_image`), until the prior of their view is read."""
         self.named = False
         """Whether `name_by` was called."""
 
@@ -273,8 +277,15 @@ class PriorLoader:
 
     def _read(self, key: Key) -> Kept | None:
         read = getattr(self.store, "coded", self.store.prior)(*key)
-        coded = CodedPrior(read, None) if isinstance(read, DepthPrior) else read
-        return None if coded is None else Kept.of(coded, self.believe, self._pin)
+        if read is None:
+            return None
+        if not isinstance(read, CodedPrior):
+            flaw = check_prior(read, f"the prior of camera {key[0]}, frame {key[1]}")
+            if flaw and key[0] not in self._flawed:
+                self._flawed.add(key[0])
+                log.warning("%s", flaw)
+            read = CodedPrior(read, None)
+        return Kept.of(read, self.believe, self._pin)
 
     def _keep(self, key: Key, kept: Kept | None) -> None:
         self._kept[key] = kept
@@ -307,6 +318,9 @@ class PriorLoader:
         if record is not None:
             some = DepthPrior(kept.known.depth[::4, ::4], kept.known.kind)  # a sample says how large the scene is
             self._cameras.check(view, record, kept.maps._replace(codes=some).decoded().depth)
+        image, colors = self.images.pop((view.camera, view.frame), None), kept.maps.codes.colors
+        if image is not None and colors is not None:
+            check_colors(view, image, colors)
 
 
 def _outline(far: Tensor) -> Tensor:

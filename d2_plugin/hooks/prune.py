@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from torch import Tensor
@@ -11,7 +12,7 @@ from torch import Tensor
 from d2_plugin.hooks.hook import Context, Hook, HookConfig, Surveyed, steps_between_evaluations
 from d2_plugin.hooks.rendered_depth import EPSILON
 from d2_plugin.protocol import Edit
-from d2_plugin.settings import AtLeastOne, Every, Positive, Share, Steps
+from d2_plugin.settings import Every, Range, Share, Steps
 
 AT_LEAST = 10
 """Steps from one evaluation to the next in a short run. Training closes a hole in some ten steps however long the run
@@ -28,13 +29,13 @@ class PruneConfig(HookConfig):
     """First step at which it no longer runs."""
     every: Every = 100
     """Steps between evaluations."""
-    tau_u: Positive = 0.1
+    tau_u: Annotated[float, Range(1e-6, 1e6)] = 0.1
     """Relative depth error at which E_k saturates."""
     tau_p: Share = 0.75
     """Score above which an evaluation counts against a Gaussian."""
     lambda_e: Share = 0.5
     """Weight of depth inconsistency; that of missing opacity contribution is lambda_o = 1 - lambda_e."""
-    patience: AtLeastOne = 5
+    patience: Annotated[int, Range(1, 1000)] = 5
     """Evaluations in a row, each with evidence, before a Gaussian is removed."""
     free_space: bool = True
     """Whether standing in space that the prior says is free counts as inconsistency too; the paper has no such term."""

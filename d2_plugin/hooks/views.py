@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
@@ -22,12 +22,13 @@ class ViewSampler:
         self._queues: dict[str, list[int]] = {}
         self._next_camera = 0
 
-    def add(self, views: Iterable[View]) -> None:
-        """Remember views; one that is known already changes nothing."""
-        for view in views:
-            if (view.camera, view.frame) not in self._views:
-                check_view(view)
-                self._views[view.camera, view.frame] = view
+    def add(self, view: View) -> bool:
+        """Remember a view; whether it was not known before."""
+        new = (view.camera, view.frame) not in self._views
+        if new:
+            check_view(view)
+            self._views[view.camera, view.frame] = view
+        return new
 
     @property
     def cameras(self) -> int:

@@ -10,7 +10,7 @@ from d2_plugin.priors.geometry import check_depth_range
 from d2_plugin.priors.monocular.settings import AlignSettings
 from d2_plugin.priors.stereo.settings import StereoSettings
 from d2_plugin.recordings.recording import MonoKind
-from d2_plugin.settings import NotNegative, Positive, Range, Settings, Share
+from d2_plugin.settings import Positive, Range, Relative, Settings, Share
 
 __all__ = ["AlignSettings", "Preprocessing", "PriorSettings", "StereoSettings", "Variant"]
 
@@ -43,18 +43,18 @@ class PriorSettings(Settings):
     """Declare a standard deviation per pixel and verify by it: two sources conflict when they differ by more than
     `conflict_sigmas`, and a map that cannot be aligned leaves stereo as it is. Off: the paper's fixed `tau_c`, sigma 0
     at verified pixels and infinite elsewhere, and no depth at all where the map cannot be aligned."""
-    conflict_sigmas: Positive = 3.0
+    conflict_sigmas: Annotated[float, Range(1e-3, 1e6)] = 3.0
     """Standard deviations of their difference above which the two sources conflict (with `uncertainty`)."""
     most_vetoed: Share = 0.01
     """Where a map contradicts more than this share of a view's geometric depths, the map is wrong, and all of them stay
     (`dual` with `uncertainty`); 1 lets every map veto."""
-    tau_c: NotNegative = 0.1
+    tau_c: Relative = 0.1
     """A geometric depth is verified when aligned monocular depth differs by less than this share of it (without
     `uncertainty`)."""
-    hanging_limit: NotNegative = 0.08
+    hanging_limit: Relative = 0.08
     """Mono-only pixels are left empty where monocular depth spans more than this share within 1 % of the image's
     width: they hang between two surfaces. 0 keeps them, as the paper does."""
-    agreement: NotNegative = 0.02
+    agreement: Relative = 0.02
     """Two cameras' monocular depths agree within this share (`dual` alone). 0 leaves the other cameras out, as in the
     paper: they neither confirm nor contradict a mono-only pixel (`d2_plugin.priors.evidence`)."""
     far: bool = True
@@ -69,7 +69,7 @@ class PriorSettings(Settings):
     """What metric monocular maps measure: planar depth `z`, or the distance from the camera along the `ray`."""
     mono_preprocessing: Preprocessing = "auto"
     """Of the network's input: `depth_anything_v2`, `unit`, or `auto`."""
-    mono_threads: Annotated[int, Range(0, unit="threads")] = 1
+    mono_threads: Annotated[int, Range(0, 1024, unit="threads")] = 1
     """Threads of one inference; 0 leaves the number to onnxruntime."""
     stereo: StereoSettings = field(default_factory=StereoSettings)
     """Geometric depth."""

@@ -1,7 +1,7 @@
 """What a run keeps in its folder, whose folder it is, and that no model is kept that diverged.
 
 run.json and metrics.json are tables with a checksum. checkpoint.pt is what `torch.save` writes, with the version of its
-form; zip's own checksums guard every tensor.
+form and a checksum of all its bytes, which are compared before torch sees them.
 """
 
 from __future__ import annotations
@@ -20,11 +20,12 @@ from d2_plugin.durable import (
     Damaged,
     Kind,
     OtherFormat,
-    archive_problem,
     is_leftover,
     make_folder,
+    opened_archive,
     read_table,
-    write,
+    refuse_inside_images,
+    write_archive,
     write_table,
 )
 from d2_plugin.errors import D2Error
@@ -33,6 +34,7 @@ from d2_plugin.hooks import finite
 from d2_plugin.hooks.finite import Diverged
 from d2_plugin.locks import only_writer
 from d2_plugin.runs.settings import RunSettings
+from d2_plugin.values import shown
 
 RUN = Kind("table of settings", 1, "run `d2 train` with another --output, or remove that folder")
 """run.json."""
@@ -85,9 +87,7 @@ def read_metrics(folder: Path) -> dict[str, Any]:
 
 def claim(folder: Path, identity: Mapping[str, Any]) -> None:
     """Take the folder, or find this very run in it; anything else is refused and nothing is written."""
-    images = Path(identity["recording"], "images")
-    if folder.resolve().is_relative_to(images):
-        raise D2Error(f"{folder} is inside {images}, where every folder is a camera: give another --output")
+    refuse_inside_images(folder)
     if folder.exists() and not folder.is_dir():
         raise D2Error(f"{folder} is a file, and a run needs a folder: give another --output")
     if (folder / "run.json").exists():
@@ -127,7 +127,7 @@ def save_checkpoint(path: Path, state: Mapping[str, Any]) -> None:
     """Write a state of plain values and tensors; a kill or a full disk leaves the checkpoint before it."""
     content = io.BytesIO()  # torch ends the process where a file that it writes itself cannot be written
     torch.save({**state, "format": CHECKPOINT_FORMAT}, content)
-    write(path, content.getbuffer())
+    write_archive(path, content)
 
 
 def load_checkpoint(path: Path, device: str) -> dict[str, Any] | None:
@@ -138,15 +138,12 @@ def load_checkpoint(path: Path, device: str) -> dict[str, Any] | None:
     """
     if not path.exists():
         return None
-    problem = archive_problem(path)
-    if problem:
-        raise Damaged(f"the checkpoint {path} is damaged ({problem}): {_REMEDY}")
-    with fitting(path):
-        state = torch.load(path, map_location=device, weights_only=True)
+    with opened_archive(path, "checkpoint", _REMEDY) as file, fitting(path):
+        state = torch.load(file, map_location=device, weights_only=True)
     form = state.get("format") if isinstance(state, dict) else None
     if form != CHECKPOINT_FORMAT:
         raise OtherFormat(
-            f"the checkpoint {path} has format {form} but this version reads format {CHECKPOINT_FORMAT}: "
+            f"the checkpoint {path} has format {shown(form)} but this version reads format {CHECKPOINT_FORMAT}: "
             "continue it with the d2-4dgs that wrote it, or remove the file to train from the start"
         )
     return state

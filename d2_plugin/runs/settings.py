@@ -14,7 +14,18 @@ from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.hooks import HOOKS
 from d2_plugin.priors.settings import PriorSettings
 from d2_plugin.reading import said, shown_path
-from d2_plugin.settings import FORMAT, Count, Positional, Range, Seed, Settings, Share, declared, of_this_format
+from d2_plugin.settings import (
+    FORMAT,
+    Count,
+    Downscale,
+    Positional,
+    Range,
+    Seed,
+    Settings,
+    Share,
+    declared,
+    of_this_format,
+)
 from d2_plugin.values import shown
 
 HOOK_NAMES = ("prior", *HOOKS)
@@ -48,13 +59,13 @@ class RunSettings(Settings):
     """Cameras to train with, as the recording names them."""
     backbone: str = "yang4d"
     """Name of a registered backbone."""
-    iterations: Annotated[int, Range(1, 10**9, unit="steps")] = 3000
+    iterations: Annotated[int, Range(1, unit="steps")] = 3000
     """Steps to train."""
     hooks: tuple[str, ...] = HOOK_NAMES
     """Parts of the method that are used."""
     seed: Seed = 0
     """Seed of everything that is drawn at random."""
-    downscale: Annotated[int, Range(1, 65_535)] = 1
+    downscale: Downscale = 1
     """Make images this many times smaller along each side."""
     frames: tuple[Count, ...] | None = None
     """Numbers of the frames to use; all if not given."""
@@ -150,10 +161,14 @@ def prior_settings(settings: RunSettings) -> PriorSettings:
 def hook_config(settings: RunSettings, priors: Path) -> D2Config:
     """The hooks of a run with schedules that fit its length, and the user's tables over the defaults."""
     hooks = tuple(name for name in settings.hooks if name != "prior")
+    d2 = settings.overrides.get("d2", {})
+    for name in d2 if isinstance(d2, Mapping) else ():
+        if name in HOOKS:
+            raise D2Error(f"d2.{name} is a table of its own: write its settings under [{name}]")
     config = for_iterations(hooks, settings.iterations, prior=str(priors), seed=settings.seed)
     plain = {name: value for name, value in asdict(config).items() if name not in HOOKS}
     tables = {name: _over(asdict(getattr(config, name)), settings.overrides.get(name, {}), name) for name in hooks}
-    return D2Config.from_dict(_over(plain, settings.overrides.get("d2", {}), "d2") | tables)
+    return D2Config.from_dict(_over(plain, d2, "d2") | tables)
 
 
 def layered(below: Any, above: Mapping[str, Any]) -> dict[str, Any]:

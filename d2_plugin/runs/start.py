@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import warnings
-import zipfile
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,10 +14,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from d2_plugin.durable import archive_problem, write
+from d2_plugin.durable import opened_archive, write_archive
 from d2_plugin.errors import D2Error, MissingExtra
 from d2_plugin.priors.colmap.points import triangulate_frames
 from d2_plugin.protocol import View
+from d2_plugin.reading import parsing
 from d2_plugin.recordings import Recording
 
 POINTS_FORMAT = 1
@@ -49,7 +49,7 @@ class TimedPoints:
         """Write an .npz with one array per attribute; an existing file is replaced in one step."""
         content = io.BytesIO()
         np.savez(content, positions=self.positions, colors=self.colors, times=self.times, format=POINTS_FORMAT)
-        write(path, content.getbuffer())
+        write_archive(path, content)
 
     @classmethod
     def load(cls, path: Path) -> TimedPoints:
@@ -58,17 +58,14 @@ class TimedPoints:
         Raises:
             D2Error: the file is damaged or that of another version.
         """
-        problem = archive_problem(path)
-        if not problem:
-            try:
-                with np.load(path, allow_pickle=False) as stored:
-                    form = stored["format"].tolist() if "format" in stored else None
-                    points = cls(stored["positions"], stored["colors"], stored["times"])
-                problem = points.problem() if form == POINTS_FORMAT else f"format {form}, expected {POINTS_FORMAT}"
-            except (OSError, ValueError, KeyError, TypeError, EOFError, MemoryError, zipfile.BadZipFile) as failure:
-                problem = str(failure)
+        remedy = "delete the file, it will be made again"
+        with opened_archive(path, "points", remedy) as file, parsing(f"points from {path}", remedy):
+            stored = np.load(file, allow_pickle=False)
+            form = stored["format"].tolist() if "format" in stored else None
+            points = cls(stored["positions"], stored["colors"], stored["times"])
+            problem = points.problem() if form == POINTS_FORMAT else f"format {form}, expected {POINTS_FORMAT}"
         if problem:
-            raise D2Error(f"cannot read points from {path} ({problem}): delete the file, it will be made again")
+            raise D2Error(f"cannot read points from {path} ({problem}): {remedy}")
         return points
 
     def problem(self) -> str:

@@ -10,6 +10,7 @@ import io
 import json
 import logging
 import tokenize
+import warnings
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
@@ -147,7 +148,9 @@ def write_entry(path: Path, array: np.ndarray, record: dict[str, Any], synced: b
 def _mapped(path: Path) -> np.ndarray:
     """The array of an .npy file, memory-mapped; unlike `np.load` it takes the file for nothing else."""
     refuse_no_file(path)
-    return np.lib.format.open_memmap(path, mode="r")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # of the names of types in a damaged header
+        return np.lib.format.open_memmap(path, mode="r")
 
 
 def hash_of(*parts: Any) -> str:

@@ -28,7 +28,15 @@ from typing import Any
 import numpy as np
 import torch
 
-from d2_plugin.durable import Kind, is_leftover, make_folder, read_table, remove_leftovers, write_table
+from d2_plugin.durable import (
+    Kind,
+    is_leftover,
+    make_folder,
+    read_table,
+    refuse_inside_images,
+    remove_leftovers,
+    write_table,
+)
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.protocol import CameraRecord, DepthPrior
 from d2_plugin.store.files import Entry, EntryFolder, hash_of
@@ -92,6 +100,7 @@ class PriorStore:
         from d2_plugin.locks import in_turn  # who reads needs none
 
         root = Path(path)
+        refuse_inside_images(root)
         if root.exists() and not root.is_dir():
             raise D2Error(f"{root} is a file, and the priors need a folder: choose another output folder")
         with in_turn(make_folder(root)):

@@ -22,6 +22,7 @@ from d2_plugin.gaussians.moving import Harmonics, MovingGaussians
 from d2_plugin.protocol import View
 from d2_plugin.recordings import Camera, Recording, Source
 from d2_plugin.runs.run import Run
+from d2_plugin.runs.saved import load_checkpoint
 from d2_plugin.runs.start import TimedPoints
 from d2_plugin.store.store import PriorStore
 from d2_plugin.viewing.camera_paths import for_size
@@ -98,7 +99,7 @@ def viewed_run(folder: Path) -> ViewedRun:
     trained, total = run.trained(), run.settings.iterations
     if not len(trained.model):
         raise D2Error(f"{folder} has no Gaussian left at step {trained.step}: nothing can be shown, train it anew")
-    hooks = torch.load(folder / "checkpoint.pt", map_location="cpu", weights_only=True)["d2"] or {}
+    hooks = (load_checkpoint(folder / "checkpoint.pt", "cpu") or {}).get("d2") or {}
     note = "" if trained.step >= total else f"{folder.name} still trains: this is step {trained.step} of {total}"
     adapter: Any = registry.load(registry.ADAPTERS, run.settings.backbone)
     return replace(_of_run(run, adapter(trained.model), hooks.get("inserted_at")), note=note)

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import os
 import random
 import string
 from pathlib import Path
 
 import pytest
-from fuzzing import ODD_TEXTS, ODD_VALUES, bounded_memory, mutate_file
+from fuzzing import ODD_TEXTS, ODD_VALUES, SEED, bounded_memory, mutate_file
 from small_layouts import write_layout
 
-from d2_plugin.commands.cli import COMMANDS, main
+from d2_plugin.commands.arguments.form import ModuleCommand
+from d2_plugin.commands.arguments.text import flag_of
+from d2_plugin.commands.cli import COMMANDS, _module, main
 
 pytest.importorskip("cv2", reason="opencv is in the `image` extra")
 
@@ -93,7 +96,87 @@ def fuzz_configurations(
             expect_an_answer(words, capsys, f"configuration {seed} {number}")
 
 
-ROUNDS = [(FEW, 0), pytest.param(MANY, 1, marks=pytest.mark.slow)]
+ROUNDS = [(FEW, 0), pytest.param(MANY, SEED, marks=pytest.mark.slow)]
+
+VARIABLES = ("D2_CACHE", "D2_CXXFLAGS", "CXX", "XDG_CACHE_HOME", "HOME", "TMPDIR", "COLUMNS", "TERM", "NO_COLOR")
+"""What the commands read of the environment."""
+
+
+def every_flag() -> list[tuple[str, str]]:
+    """Each command with each of its flags, those of tables and of both backbones included."""
+    found: set[tuple[str, str]] = set()
+    for name, command in COMMANDS.items():
+        for more in ([], ["--backbone", "deform"], ["--calibration", "x"]):
+            words = ["training", *more] if name == "bench" else more
+            form = command.form(f"d2 {name}") if isinstance(command, ModuleCommand) else _module(command).form(words)
+            names = [s.name for s in form.settings if not s.positional]
+            names += [f"{section.name}.{s.name}" for section in form.sections(words).values() for s in section.settings]
+            found |= {(name, flag_of(one)) for one in names if one != "output"}  # what can be written is written
+    return sorted(found)
+
+
+def odd_word(rng: random.Random) -> str:
+    """What somebody may write who means harm, or mistypes."""
+    numbers = (
+        "1" + "0" * 25,
+        "1e25",
+        "1e-320",
+        "-1e-320",
+        "2000000000",
+        "-2000000000",
+        "1e9,1e9",
+        "0:10:-1",
+        "1:",
+        ":",
+    )
+    places = ("/dev/null", "/dev/zero", "/proc/self/mem", "~nobody/x", "loop", "file", ".", "x" * 300, "pipe")
+    return rng.choice((*map(str, ODD_VALUES), *ODD_TEXTS, *numbers, *places)).replace("\0", "")
+
+
+def fuzz_flags(count: int, seed: int, recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Every flag of every command with odd values; no output can be written, and nothing is there to be shown."""
+    flags = every_flag()
+    (tmp_path / "file").write_text("in the way of every output")
+    (tmp_path / "loop").symlink_to("loop")
+    os.mkfifo(tmp_path / "pipe")
+    assert len(flags) > 300
+    with bounded_memory():
+        for number in range(count):
+            rng = random.Random(f"flags {seed} {number}")
+            name, flag = rng.choice(flags)
+            first = {"demo": [], "bench": ["training", "nowhere@a+b"], "view": ["nowhere"]}
+            words = [name, *first.get(name, [str(recording)])]
+            words += ["--train-cameras", "cam00,cam01"] if name in ("train", "plan", "priors", "ablate") else []
+            words += [] if name in ("plan", "eval", "view", "compare", "doctor") else ["--output", "file/out"]
+            words += ["--backbone", "deform"] if "mlp" in flag or "hexplane" in flag else []
+            words += ["--calibration", "x"] if flag.startswith("--import") else []
+            expect_an_answer([*words, f"{flag}={odd_word(rng)}"], capsys, f"flags {seed} {number}")
+
+
+@pytest.mark.parametrize(("count", "seed"), ROUNDS)
+def test_every_flag_with_odd_values(
+    recording: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    count: int,
+    seed: int,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    fuzz_flags(count, seed, recording, tmp_path, capsys)
+
+
+@pytest.mark.parametrize(("count", "seed"), ROUNDS)
+def test_the_environment_at_random(
+    recording: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, count: int, seed: int
+) -> None:
+    for number in range(count // 4):
+        rng = random.Random(f"environment {seed} {number}")
+        with monkeypatch.context() as changed:
+            for variable in rng.sample(VARIABLES, 2):
+                changed.setenv(variable, odd_word(rng).encode("utf-8", "replace").decode())
+            words = rng.choice((["doctor"], ["--help"], ["plan", str(recording), "--train-cameras", "cam00,cam01"]))
+            expect_an_answer(words, capsys, f"environment {seed} {number}")
 
 
 @pytest.mark.parametrize(("count", "seed"), ROUNDS)

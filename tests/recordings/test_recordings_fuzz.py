@@ -11,7 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from fuzzing import bounded_memory, expect_result_or_sentence, mutate_file
+from fuzzing import SEED, bounded_memory, expect_result_or_sentence, mutate_file
 from small_layouts import write_layout
 
 pytest.importorskip("cv2", reason="opencv is in the `image` extra")
@@ -87,7 +87,7 @@ def test_what_is_damaged_is_valid_or_one_sentence(written: Callable, name: str, 
 @pytest.mark.slow
 @pytest.mark.parametrize(("written", "name"), TABLE)
 def test_two_thousand_damaged_files(written: Callable, name: str, tmp_path: Path) -> None:
-    fuzz(written, name, tmp_path / "files", MANY, 1)
+    fuzz(written, name, tmp_path / "files", MANY, SEED)
 
 
 @pytest.mark.parametrize(

@@ -52,7 +52,7 @@ class Day:
     def _next(self, seed: int) -> list[str]:
         """Mostly a run; now and then a build of the priors that it shares with the others, or of fewer cameras."""
         chance = self.draw.random()
-        if chance > 0.1:
+        if chance > 0.1 and (self.store / "store.json").is_file():
             return self.words(seed)
         self.builds += 1
         cameras = "train0,train1" if chance > 0.05 else "train1"

@@ -9,14 +9,14 @@ from pathlib import Path
 import torch
 
 from d2_plugin.durable import write_table
-from d2_plugin.runs.saved import RUN
+from d2_plugin.runs.saved import RUN, save_checkpoint
 
 
 def still_training(trained: Path, copy: Path, step: int) -> Path:
     """A copy of a run at an earlier step."""
     shutil.copytree(trained, copy)
     state = torch.load(copy / "checkpoint.pt", weights_only=True)
-    torch.save(state | {"step": step}, copy / "checkpoint.pt")
+    save_checkpoint(copy / "checkpoint.pt", state | {"step": step})
     return copy
 
 
@@ -29,7 +29,7 @@ def emptied(trained: Path, copy: Path) -> Path:
         "statistics": {name: value[:0] for name, value in state["model"]["statistics"].items()},
         "optimizer": state["model"]["optimizer"] | {"state": {}},
     }
-    torch.save(state, copy / "checkpoint.pt")
+    save_checkpoint(copy / "checkpoint.pt", state)
     return copy
 
 

@@ -122,9 +122,9 @@ def test_time_plays_bounces_slows_and_freezes(viewed: ViewedRun) -> None:
 @pytest.mark.parametrize(
     ("settings", "says"),
     [
-        ({"seconds": 1e300}, "would have 1.2e.301 images, at most 1000000"),
+        ({"seconds": 1e6}, "would have 1.2e.07 images, at most 1000000"),
         ({"speed": 1e-6}, "images, at most 1000000: choose fewer --seconds"),
-        ({"path": "orbit", "seconds": 1e300}, "images, at most 1000000"),
+        ({"path": "orbit", "seconds": 1e6}, "images, at most 1000000"),
     ],
 )
 def test_a_video_without_end_is_refused_before_it_is_laid_out(viewed: ViewedRun, settings: dict, says: str) -> None:

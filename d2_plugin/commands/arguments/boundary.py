@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
+import threading
 import traceback
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 
 from d2_plugin.errors import D2Error
 from d2_plugin.reading import said, shown_path
@@ -23,11 +25,12 @@ OUT_OF_MEMORY = ("can't allocate memory", "not enough memory", "insufficient mem
 
 def guarded(answer: Callable[[], str | None], debug: bool = False) -> int:
     """Print what `answer` returns and give 0, or print the sentence of its exception and give another exit code."""
-    for stream in (sys.stdout, sys.stderr):  # letters that the terminal lacks are written as escapes
-        with suppress(AttributeError, OSError, ValueError):
-            stream.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
+    interrupted: list[int] = []
+    _open_closed_streams()
+    _take_any_letter()
     try:
-        text = answer()
+        with _noticed() as interrupted:
+            text = answer()
         if text:
             sys.stdout.write(f"{text}\n")
         sys.stdout.flush()
@@ -39,9 +42,30 @@ def guarded(answer: Callable[[], str | None], debug: bool = False) -> int:
     except (Exception, KeyboardInterrupt) as failure:
         if debug:
             sys.stderr.write(traceback.format_exc())
-        sys.stderr.write(f"d2: {sentence(failure)}\n")
-        return STOPPED if isinstance(failure, KeyboardInterrupt) else REFUSED
+        stopped = KeyboardInterrupt() if interrupted else failure
+        sys.stderr.write(f"d2: {sentence(stopped)}\n")
+        return STOPPED if isinstance(stopped, KeyboardInterrupt) else REFUSED
     return 0
+
+
+@contextmanager
+def _noticed() -> Iterator[list[int]]:
+    """Within it, the list holds every Ctrl-C: C code that is being imported makes another exception of it."""
+    interrupts: list[int] = []
+
+    def stop(number: int, frame: object) -> None:
+        interrupts.append(number)
+        raise KeyboardInterrupt
+
+    before = signal.getsignal(signal.SIGINT)
+    ours = before is signal.default_int_handler and threading.current_thread() is threading.main_thread()
+    if ours:
+        signal.signal(signal.SIGINT, stop)
+    try:
+        yield interrupts
+    finally:
+        if ours:
+            signal.signal(signal.SIGINT, before)
 
 
 def sentence(failure: BaseException) -> str:
@@ -68,3 +92,23 @@ def sentence(failure: BaseException) -> str:
 def one_line(text: str) -> str:
     """A text without line breaks and control characters, which a name in it may hold."""
     return shown_path(" ".join(text.splitlines()))
+
+
+def _open_closed_streams() -> None:
+    """Nothing stands where a standard stream was closed: a file opened later would get its number, and what libraries
+    print would be written into it."""
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        if getattr(sys, name) is None:
+            stream = open(os.devnull, "r+", encoding="utf-8")  # noqa: SIM115  to the end of the process
+            try:
+                os.fstat(number)
+            except OSError:
+                os.dup2(stream.fileno(), number)
+            setattr(sys, name, stream)
+
+
+def _take_any_letter() -> None:
+    """Let the two streams write letters that the terminal lacks as escapes instead of failing."""
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(AttributeError, OSError, ValueError):
+            stream.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]

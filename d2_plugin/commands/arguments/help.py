@@ -6,17 +6,15 @@ import itertools
 import shutil
 import textwrap
 from collections.abc import Sequence
-from dataclasses import MISSING, replace
+from dataclasses import MISSING
 
 from d2_plugin.commands.arguments.form import HELP, Form, Section, typed_as
 from d2_plugin.commands.arguments.text import bare, flag_of, item_kind, limits, placeholder, written
 from d2_plugin.errors import unknown_name
-from d2_plugin.settings import Declared
+from d2_plugin.settings import Declared, Range
 
 COLUMN = 30
 """Where the explanations begin."""
-LARGE = 1e15
-"""An upper bound beyond this is the machine's and not worth reading."""
 
 
 def help_text(form: Form, words: Sequence[str]) -> str:
@@ -74,13 +72,20 @@ def _typed(setting: Declared) -> str:
 
 
 def _explained(setting: Declared) -> str:
-    """The docstring, then unit, range, and the default where it is a value: no word for a switch that is off."""
-    where, default = limits(setting), setting.default
-    if where.high is not None and where.high > LARGE:
-        where = replace(where, high=None)
-    facts = [where.unit, str(where) if (where.low, where.high) != (None, None) else ""]
-    bounds = ", ".join(fact for fact in facts if fact)
-    off = default is None or default in ("", ()) or (default is False and "." not in setting.name)
-    known = "needed" if default is MISSING else "" if off else f"default {written(default)}"
-    text = "; ".join(fact for fact in (bounds, known) if fact)
-    return f"{setting.help} ({text})".strip() if text else setting.help
+    """The docstring, then range, unit and default."""
+    facts = [_bounds(limits(setting)), "needed" if setting.default is MISSING else _default(setting)]
+    facts_text = "; ".join(fact for fact in facts if fact)
+    return f"{setting.help} ({facts_text})".strip() if facts_text else setting.help
+
+
+def _bounds(where: Range) -> str:
+    bounds = where.described()
+    return ", ".join(part for part in (where.unit, bounds) if part not in ("", "finite"))
+
+
+def _default(setting: Declared) -> str:
+    """The default where it is a value: not for what is left out, and not for a switch that is off."""
+    off = setting.default is False and "." not in setting.name
+    if off or setting.default is None or setting.default in ("", ()):
+        return ""
+    return f"default {written(setting.default)}"

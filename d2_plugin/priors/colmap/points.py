@@ -25,6 +25,7 @@ from d2_plugin.arrays import read_array
 from d2_plugin.errors import D2Error
 from d2_plugin.extras import import_pycolmap
 from d2_plugin.priors.geometry import relative_pose
+from d2_plugin.reading import said
 from d2_plugin.recordings.recording import Camera, Recording
 
 LUMA = np.array([0.299, 0.587, 0.114])
@@ -130,7 +131,11 @@ def triangulate(
         pairs = _matched_pairs(features, cameras)
         if not pairs:
             return SparsePoints.empty()
-        model = _triangulated(pycolmap, Path(folder), cameras, features, pairs)
+        try:
+            model = _triangulated(pycolmap, Path(folder), cameras, features, pairs)
+        except RuntimeError as failure:  # of its database, where the disk is full
+            remedy = "make room there, or name another folder for temporary files in TMPDIR"
+            raise D2Error(f"COLMAP cannot triangulate in {folder} ({said(failure)}): {remedy}") from failure
         return _collected(model, images, frame)
 
 

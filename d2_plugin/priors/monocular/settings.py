@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
-from d2_plugin.settings import Count, Positive, Settings, Share
+from d2_plugin.settings import Count, Range, Settings, Share
 
 
 @dataclass(frozen=True)
@@ -14,7 +14,7 @@ class AlignSettings(Settings):
 
     residual: Literal["relative", "absolute"] = "relative"
     """`absolute` is the paper's a D^m + b - D^g; `relative` divides it by D^g, as verification does."""
-    epsilon: Positive = 0.02
+    epsilon: Annotated[float, Range(1e-6, 1e6)] = 0.02
     """Smoothing of the Charbonnier penalty: of the relative residual, or (absolute) times the median of the target."""
     min_anchors: Count = 50
     """Fewer anchors than this are refused."""

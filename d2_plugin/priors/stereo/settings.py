@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 from d2_plugin.errors import D2Error
-from d2_plugin.settings import Angle, Count, Range, Seed, Settings, Share
+from d2_plugin.settings import Angle, Range, Seed, Settings, Share
 
 MatcherName = Literal["auto", "none", "sensor", "workspace", "colmap", "patchmatch"]
 """What matches views, or what kind of depth on disk is taken in place of matching."""
@@ -39,7 +39,7 @@ class StereoSettings(Settings):
     folder: str = ""
     """Where the depth on disk lies, relative to the recording; `{frame}` (as in `mvs/{frame:05d}`) stands for the frame
     number. Where empty: `depth` for `sensor`, `colmap/FRAME`, `colmap` or `dense` for `workspace`."""
-    max_pixels: Annotated[int, Range(1, unit="pixels")] = 500_000
+    max_pixels: Annotated[int, Range(1, 1 << 28, unit="pixels")] = 500_000
     """Images with more pixels are matched at a half, a third, ... of their size; depth comes back at full size."""
     patchmatch_device: Literal["auto", "cuda", "cpu"] = "auto"
     """Where patchmatch runs: `auto` takes the GPU where torch sees one. Both return the same depth."""
@@ -47,11 +47,11 @@ class StereoSettings(Settings):
     """At most this many other views are matched, by COLMAP too: those that overlap at a good angle."""
     colmap_geometric: bool = True
     """Whether COLMAP's second pass runs, which asks the other views' depths; the paper's COLMAP does."""
-    colmap_minutes: Annotated[float, Range(0, unit="minutes", open_low=True)] = 30.0
+    colmap_minutes: Annotated[float, Range(0.01, 100_000, unit="minutes")] = 30.0
     """COLMAP is ended when it takes longer than this for one timestamp."""
     between_pixels: bool = True
     """Read a source's depth between its pixels where they are one surface; off, that of the nearest one."""
-    min_sources: Count = 1
+    min_sources: Annotated[int, Range(0, 1000)] = 1
     """Number of sources that must confirm a depth; all of them where there are fewer."""
     min_angle: Angle = 1.0
     """A source confirms only where both rays meet at more than this; identical cameras never do."""
@@ -62,7 +62,7 @@ class StereoSettings(Settings):
     """Relative standard deviation of a depth sensor; matched depth declares its own."""
     reuse_static: bool = True
     """Carry matches over where the image did not change; off matches every frame in full."""
-    reuse_block: Annotated[int, Range(0, unit="frames")] = 30
+    reuse_block: Annotated[int, Range(0, 1_000_000, unit="frames")] = 30
     """After this many frames everything is matched anew; blocks are independent, and shards are made of them."""
     seed: Seed = 0
     """Seed of the matchers that draw random hypotheses."""

@@ -77,7 +77,7 @@ def whole_folder(path: Path | str) -> Iterator[Path]:
     Raises:
         D2Error: `path` holds something, somebody else is writing it, or the disk is full, broken or not ours.
     """
-    folder = Path(path).resolve()
+    folder = Path(os.path.realpath(path))
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise D2Error(f"{path} already exists and is not empty: choose another folder, nothing was written")
     if folder == Path.cwd() or folder.is_mount():

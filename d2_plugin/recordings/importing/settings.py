@@ -21,13 +21,13 @@ class ImportChoices(Settings):
     offsets: tuple[str, ...] = ("auto",)
     """How the cameras' start is found: auto (timecode, then sound, then motion), timecode, sound, motion, none (they
     start together), or given as NAME=FRAMES,...: how many of its frames after the first camera each one started."""
-    times: tuple[Annotated[float, Range(0, unit="seconds")], ...] | None = None
+    times: tuple[Annotated[float, Range(0, 1e6, unit="seconds")], ...] | None = None
     """First and last second to take, joined by a comma, of the time that all cameras recorded."""
     frames: tuple[Count, ...] | None = None
     """Numbers of the frames to take, written first:last or first:last:step, the last one included."""
-    rate: Annotated[float, Range(0, 1000, unit="frames per second", open_low=True)] | None = None
+    rate: Annotated[float, Range(1e-3, 1000, unit="frames per second")] | None = None
     """Frames to take per second; those of the slowest camera if not given."""
-    scale: Annotated[float, Range(0, 1, open_low=True)] = 1.0
+    scale: Annotated[float, Range(1e-4, 1)] = 1.0
     """Make images smaller by this factor."""
     crop: tuple[str, ...] = ()
     """Part to keep, WIDTHxHEIGHT+LEFT+TOP in pixels of the upright video; NAME=... for one camera, joined by commas."""
@@ -94,8 +94,12 @@ def by_camera(
         D2Error: a camera that is not among `names`, or what is no value.
     """
     values: dict[str, Any] = {}
+    seen: list[str] = []
     for text in texts:
         name, named, written = text.rpartition("=")
+        if named and name in seen:
+            raise D2Error(f"{option} names camera '{name}' twice: leave one of them out")
+        seen += [name] if named else []
         if named and name not in names:
             raise D2Error(f"{option} names camera '{name}', have {', '.join(names)}: correct the name")
         given = value(written.strip())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
@@ -48,7 +49,7 @@ def paths_of(settings: ImportSettings) -> dict[str, Path]:
             raise D2Error(
                 f"{by_name[path.stem]} and {path} are both called {path.stem}: name each video like its camera"
             )
-        by_name[path.stem] = path.resolve()
+        by_name[path.stem] = Path(os.path.realpath(path))
     return by_name
 
 

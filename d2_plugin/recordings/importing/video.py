@@ -7,6 +7,7 @@ decoded once, and its frames are counted.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -23,12 +24,32 @@ from d2_plugin.reading import opened, parsing, said, shown_path
 from d2_plugin.recordings.images import MOST_PIXELS
 from d2_plugin.recordings.recording import Source
 
-VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm", ".mts", ".m2ts", ".mpg", ".mpeg", ".360", ".lrv")
+VIDEO_SUFFIXES = (
+    ".mp4",
+    ".mov",
+    ".m4v",
+    ".mkv",
+    ".avi",
+    ".webm",
+    ".mts",
+    ".m2ts",
+    ".mpg",
+    ".mpeg",
+    ".360",
+    ".lrv",
+    ".ts",
+)
 """Endings by which a folder's videos are listed."""
 
 BT709 = 1  # FFmpeg's number of the transfer function and of the primaries of SDR
 
 HDR, WIDE = {16: "PQ", 18: "HLG"}, {9: "BT.2020"}  # the same of what HDR has
+NOT_READ = (".gif", ".sdp", ".m3u8", ".wmv", ".flv", ".ogv", ".3gp", ".vob", ".mxf", ".h264", ".hevc", ".r3d", ".braw")
+"""Endings of videos that no reader here opens."""
+
+_log = logging.getLogger(__name__)
+
+REMEDY = "replace the file or leave its camera out"
 
 SKIP_LIMIT = 48
 """A frame at most this far ahead is reached by decoding on; any other by a seek, which starts at a key frame."""
@@ -195,6 +216,9 @@ def usual_rate(rate: float) -> float:
 def videos_below(folder: Path) -> tuple[Path, ...]:
     """The videos directly in a folder, sorted by name."""
     paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in VIDEO_SUFFIXES)
+    left = sorted(path.name for path in folder.iterdir() if path.suffix.lower() in NOT_READ)
+    if left:
+        _log.warning("%s: %s left out, of a kind that is not read: convert to MP4", folder, ", ".join(left))
     return tuple(path for path in paths if not path.name.startswith("."))
 
 

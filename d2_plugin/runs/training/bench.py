@@ -26,7 +26,7 @@ from d2_plugin.runs.rows import TRY, Row, append_rows, case_name, command_line, 
 from d2_plugin.runs.settings import RunSettings
 from d2_plugin.runs.shared import Shared, share, share_points
 from d2_plugin.runs.training.measured import Line, Work, follow, workers
-from d2_plugin.settings import AtATime, AtLeastOne, Count, Positional, Positive, Range, Seed, Settings
+from d2_plugin.settings import AtATime, Count, Downscale, Positional, Range, Seed, Settings
 
 PILOT = 100
 """Steps of the first try."""
@@ -49,7 +49,7 @@ class TrainingBench(Settings):
     """Recordings with their cameras, as PATH@TRAIN+TRAIN or PATH@TRAIN+TRAIN@SCORE+SCORE."""
     methods: tuple[str, ...] = ("backbone", "mvs_only", "full")
     """Rows or tables of `d2 ablate`."""
-    seconds: tuple[Positive, ...] = ()
+    seconds: tuple[Annotated[float, Range(1e-3, 1e7, unit="seconds")], ...] = ()
     """CPU seconds of training to compare at; 10, 30 and 100 if neither these nor steps are given."""
     steps: tuple[Annotated[int, Range(1, unit="steps")], ...] = ()
     """Numbers of steps to compare at."""
@@ -61,7 +61,7 @@ class TrainingBench(Settings):
     """Numbers of the frames, in every recording; all if not given."""
     hold_out_instants: Annotated[int, Range(0, 10_000, unit="instants")] = 0
     """Train every so-manieth instant alone and score those between apart; 0 or 1 trains all."""
-    downscale: AtLeastOne = 1
+    downscale: Downscale = 1
     """Make images this many times smaller along each side."""
     mono_onnx: str | None = None
     """ONNX model of monocular depth; the recordings' own maps if not given."""
@@ -138,7 +138,7 @@ def case_of(text: str, base: RunSettings) -> Case:
     train, test, _ = resolve_cameras(path, named[0], named[1] if len(named) > 1 else None)
     protocol = split_name(named[0])
     settings = replace(base, recording=path, train_cameras=train, test_cameras=test, protocol=protocol)
-    title = Path(path).resolve().name
+    title = Path(os.path.realpath(path)).name
     slug = "_".join([title, *train]) + (f"_small{base.downscale}" if base.downscale > 1 else "")
     slug += f"_every{base.hold_out_instants}" if base.hold_out_instants > 1 else ""
     slug += f"_{protocol.replace(':', '_')}" if protocol else ""

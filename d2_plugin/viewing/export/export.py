@@ -10,7 +10,7 @@ from d2_plugin.durable import make_folder, refuse_foreign, remove_leftovers
 from d2_plugin.errors import D2Error
 from d2_plugin.locks import only_writer
 from d2_plugin.progress import progress_bar
-from d2_plugin.settings import AtLeastOne, Count, Positional, Positive, Settings
+from d2_plugin.settings import Count, Downscale, Positional, Range, Settings
 from d2_plugin.viewing.checkpoints import open_viewed
 from d2_plugin.viewing.export.coded import seen_rows
 from d2_plugin.viewing.export.page import GENERATOR, write_page
@@ -33,13 +33,13 @@ class Export(Settings):
     """Folder to write into; `export` inside the run's folder if not given."""
     frames: tuple[Count, ...] | None = None
     """first:last or first:last:step, the last one included, of ply and spz; all frames if not given."""
-    megabytes: Positive = 40.0
+    megabytes: Annotated[float, Range(1e-3, 1e6)] = 40.0
     """Size of an html page that key times of a deformation field, or harmonics in 8 bits, may bring it to."""
     recording: Path | None = None
     """The recording of a checkpoint of an official trainer."""
     train_cameras: tuple[str, ...] | None = None
     """Cameras that such a checkpoint was trained with; all but these are held out."""
-    downscale: AtLeastOne = 1
+    downscale: Downscale = 1
     """For such a checkpoint: the recording's cameras with images this many times smaller."""
 
 

@@ -41,7 +41,7 @@ def write_spz(path: Path, gaussians: MovingGaussians, shapes: tuple[Tensor, Tens
     coefficients, degree = shown.harmonics.without_time().numpy(), shown.harmonics.degree
     planes = [
         np.stack([fixed & 255, fixed >> 8 & 255, fixed >> 16], -1),
-        shown.opacities.numpy() * 255,
+        np.minimum(shown.opacities.numpy() * 255, 254),  # readers take the logit, which is infinite at 255
         (0.15 * coefficients[:, 0] + 0.5) * 255,
         (scales.log().numpy() + 10) * 16,
     ]

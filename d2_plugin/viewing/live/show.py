@@ -17,7 +17,7 @@ from d2_plugin.recordings import open_recording
 from d2_plugin.runs.metrics import psnr
 from d2_plugin.runs.run import Run
 from d2_plugin.runs.saved import OnStep
-from d2_plugin.settings import AtLeastOne, Positional, Range, Settings
+from d2_plugin.settings import Downscale, Positional, Range, Settings
 from d2_plugin.store.store import PriorStore
 from d2_plugin.viewing.checkpoints import is_output_folder, open_viewed
 from d2_plugin.viewing.live.images import Share
@@ -48,7 +48,7 @@ class ViewSettings(Settings):
     """The recording of a prior or of a checkpoint."""
     train_cameras: tuple[str, ...] | None = None
     """Cameras that such a checkpoint was trained with."""
-    downscale: AtLeastOne = 1
+    downscale: Downscale = 1
     """Make the recording's images this many times smaller."""
 
 

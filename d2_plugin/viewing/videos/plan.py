@@ -11,7 +11,7 @@ import numpy as np
 
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.recordings import Camera
-from d2_plugin.settings import AtLeastOne, Positional, Range, Settings
+from d2_plugin.settings import Downscale, Positional, Range, Settings
 from d2_plugin.viewing.camera_paths import orbit, read_camera_path, spiral, through
 from d2_plugin.viewing.panels import RECORDED
 from d2_plugin.viewing.videos.video import RATES, Format
@@ -42,16 +42,16 @@ class RenderSettings(Settings):
     cameras also truth, error, true-depth, and from the depth prior: prior, sigma, labels."""
     cameras: tuple[str, ...] | None = None
     """Cameras of the path; by default all held-out or all training cameras."""
-    at: Annotated[float, Range(0, unit="seconds")] | None = None
+    at: Annotated[float, Range(0, 1e6, unit="seconds")] | None = None
     """Freeze time at this instant while the camera moves."""
     speed: Annotated[float, Range(1e-6, 1e6)] = 1.0
     """Of time in the recording: 0.25 is slow motion, with images between the recorded frames."""
-    seconds: Annotated[float, Range(0, unit="seconds", open_low=True)] | None = None
+    seconds: Annotated[float, Range(1e-3, 1e6, unit="seconds")] | None = None
     """Length of the video, for each camera where it stands; by default that of the recording, and at least 6 where the
     camera moves. Time runs back and forth in a video that is longer than the recording."""
     fps: Annotated[float, Range(*RATES, unit="images per second")] | None = None
     """Of the video; by default those of the recording."""
-    degrees: Annotated[float, Range(0, 360, unit="degrees", open_low=True)] | None = None
+    degrees: Annotated[float, Range(0.01, 360, unit="degrees")] | None = None
     """Angle that an orbit swings; by default what the training cameras span: the rest was not recorded."""
     width: Annotated[int, Range(1, 16384, unit="pixels")] | None = None
     """Width of each image; by default the camera's."""
@@ -67,7 +67,7 @@ class RenderSettings(Settings):
     """The recording of a checkpoint of an official trainer."""
     train_cameras: tuple[str, ...] | None = None
     """Cameras that such a checkpoint was trained with; all but these are held out."""
-    downscale: AtLeastOne = 1
+    downscale: Downscale = 1
     """For such a checkpoint: make the recording's images this many times smaller."""
 
     @property

@@ -19,7 +19,7 @@ from d2_plugin.recordings.cameras.calibrating.bundle import Tracks, fitting, tri
 from d2_plugin.recordings.cameras.calibrating.features import Features, Matches
 from d2_plugin.recordings.cameras.calibrating.rig import SolvedRig
 from d2_plugin.recordings.images import checked_image, opencv
-from d2_plugin.settings import Positive, Range, Settings
+from d2_plugin.settings import Range, Settings
 from d2_plugin.values import checked_arguments
 
 FEWEST_SIDES = 4  # sides of squares that must be measured
@@ -43,8 +43,8 @@ class Board(Settings):
 
     columns: Squares
     rows: Squares
-    square: Positive
-    marker: Positive | None = None
+    square: Annotated[float, Range(1e-6, 1e6)]
+    marker: Annotated[float, Range(1e-6, 1e6)] | None = None
     dictionary: str = "DICT_4X4_50"
 
     def __post_init__(self) -> None:

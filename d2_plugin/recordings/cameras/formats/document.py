@@ -11,15 +11,13 @@ from typing import Annotated, Any
 import numpy as np
 
 from d2_plugin.errors import D2Error, missing_extra
-from d2_plugin.older import tomllib
-from d2_plugin.reading import field, parse_json, parsing, read_bytes, read_text, said
+from d2_plugin.reading import DEEPEST, check_slow, field, parse_json, parse_toml, parsing, read_bytes, read_text, said
 from d2_plugin.recordings.cameras.camera import LARGEST_NUMBER
 from d2_plugin.values import Range, shown
 
 CORRECT = "correct the file, see docs/calibration.md"
 
 MOST_BYTES = 1 << 26  # larger calibrations are refused: a rig of 500 cameras takes a few hundred kilobytes
-DEEPEST = 64  # of lists and tables within each other in YAML
 
 XML = {
     "<opencv_storage": "XML of OpenCV, which no rig is read from: write intri.yml and extri.yml, or Pose2Sim's TOML",
@@ -62,10 +60,9 @@ class Document:
         if text.startswith("%YAML"):
             return None
         plain_yaml = re.search(r"^[\w.-]+:(\s|$)", text, re.MULTILINE)
-        if plain_yaml and not re.search(r"^\s*\[", text, re.MULTILINE):
+        if plain_yaml and not re.search(r"^[ \t]*\[", text, re.MULTILINE):
             return parse_yaml(text, self.place)
-        with parsing(f"{self.place}, which is not valid TOML", CORRECT):
-            return tomllib.loads(text)
+        return parse_toml(text, self.place, CORRECT)
 
     @property
     def table(self) -> Table:
@@ -127,13 +124,21 @@ def parse_yaml(text: str, place: str) -> Any:
         import yaml
     except ImportError:
         raise missing_extra("PyYAML", "calibration", f"reading {place}") from None
-    loader = getattr(yaml, "CBaseLoader", yaml.BaseLoader)  # written in C where it is there
+    check_slow(text, place, CORRECT)
+    open_ones: list[list[Any]] = [[]]
     with parsing(place, CORRECT):
-        depth = 0
-        for event in yaml.parse(text, Loader=loader):
+        for event in yaml.parse(text, Loader=getattr(yaml, "CBaseLoader", yaml.BaseLoader)):  # in C where it is there
             if isinstance(event, yaml.AliasEvent):
                 raise D2Error(f"{place} has YAML aliases (*name), which no calibration needs: {CORRECT}")
-            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
-            if depth > DEEPEST:  # libyaml goes down into lists of lists until the stack ends
-                raise D2Error(f"{place} is YAML nested more than {DEEPEST} deep: {CORRECT}")
-        return yaml.load(text, Loader=loader)
+            if isinstance(event, yaml.CollectionStartEvent):
+                open_ones.append([])
+                if len(open_ones) > DEEPEST:
+                    raise D2Error(f"{place} is YAML nested more than {DEEPEST} deep: {CORRECT}")
+            elif isinstance(event, yaml.CollectionEndEvent):
+                items = open_ones.pop()
+                table = isinstance(event, yaml.MappingEndEvent)
+                open_ones[-1].append(dict(zip(items[::2], items[1::2], strict=True)) if table else items)
+            elif isinstance(event, yaml.ScalarEvent):
+                open_ones[-1].append(event.value)
+        (content,) = open_ones[0]  # one document
+        return content

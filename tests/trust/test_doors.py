@@ -1,0 +1,250 @@
+"""Doors that a hostile or unlucky user found: one sentence each, in bounded time, and nothing of theirs is touched."""
+
+from __future__ import annotations
+
+import contextlib
+import gzip
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import command_lines
+import pytest
+import torch
+from small_layouts import write_layout
+
+from d2_plugin.cache import Untrusted, cache_folder, check_private
+from d2_plugin.commands import cli
+from d2_plugin.commands.cli import main
+from d2_plugin.durable import refuse_foreign
+from d2_plugin.errors import D2Error
+from d2_plugin.gaussians.moving import Harmonics, MovingGaussians
+from d2_plugin.reading import Unreadable, parse_json, parse_toml
+from d2_plugin.recordings.cameras.formats.document import Document
+from d2_plugin.recordings.importing.settings import by_camera, finite
+from d2_plugin.recordings.importing.video import videos_below
+from d2_plugin.viewing.export.ply import scales_and_rotations
+from d2_plugin.viewing.export.spz import write_spz
+
+pytest.importorskip("cv2", reason="opencv is in the `image` extra")
+
+Refused = Callable[..., str]
+
+
+@pytest.fixture
+def refused(capsys: pytest.CaptureFixture[str]) -> Refused:
+    return partial(command_lines.refused, capsys)
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_layout("folder", tmp_path_factory.mktemp("doors") / "small")
+
+
+def test_a_prior_that_was_mistyped_is_not_built(recording: Path, tmp_path: Path, refused: Refused) -> None:
+    words = ["train", recording, "--train-cameras", "cam00,cam01", "--output", tmp_path / "run"]
+    assert "no depth priors at" in refused(*words, "--priors", tmp_path / "typo")
+    assert not list(tmp_path.iterdir())
+
+
+def test_nothing_is_written_inside_the_images_of_a_recording(recording: Path, tmp_path: Path, refused: Refused) -> None:
+    (tmp_path / "room").symlink_to(recording)
+    for place in (recording / "images" / "zz", tmp_path / "room" / "images" / "zz" / "deeper"):
+        for command in ("train", "priors"):
+            words = [command, recording, "--train-cameras", "cam00,cam01", "--output", place]
+            assert "where every folder is a camera" in refused(*words)
+        with pytest.raises(D2Error, match="where every folder is a camera"):
+            refuse_foreign(place / "report.md", "sign", "d2 report")
+    assert not (recording / "images" / "zz").exists()
+
+
+@pytest.mark.parametrize("hooks", ["all", "none"])
+@pytest.mark.parametrize("value", ["5", "{ scale = 1.0 }"])
+def test_a_hook_inside_another_table_is_refused(
+    recording: Path, tmp_path: Path, refused: Refused, hooks: str, value: str
+) -> None:
+    (tmp_path / "d2.toml").write_text(f"[d2]\ndensify = {value}\n")
+    words = ["train", recording, "--train-cameras", "cam00,cam01", "--hooks", hooks, "--output", tmp_path / "run"]
+    assert "d2.densify is a table of its own" in refused(*words, "--config", tmp_path / "d2.toml")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "a: " + "[" * 10_000,
+        "a: [" + "1," * 3_000_000 + "1]",
+        "\n" * 1_000_000 + "a: 1",
+        "a." * 100_000 + "a = 1",
+        "[" + "a." * 100_000 + "a]",
+        "x = {" + "a." * 100_000 + "a = 1}",
+        '{"a": 1,' + ",".join(f'"k{i}": 1' for i in range(100_000)) + ',"k99999": 1}',
+    ],
+    ids=["lists in lists", "a long list", "empty lines", "a key", "a table", "an inline table", "a name twice"],
+)
+def test_no_text_takes_long(tmp_path: Path, text: str) -> None:
+    (tmp_path / "rig.yml").write_text(text)
+    start = time.process_time()
+    with contextlib.suppress(D2Error):
+        assert Document(tmp_path / "rig.yml").content == {"a": "1"}
+    assert time.process_time() - start < 20
+
+
+def test_a_list_of_yaml_is_what_it_says(tmp_path: Path) -> None:
+    (tmp_path / "rig.yml").write_text("a: {b: 1, c: [x, y, {d: 'e'}]}\nf:\n- 1\n- g: ''\n")
+    assert Document(tmp_path / "rig.yml").content == {
+        "a": {"b": "1", "c": ["x", "y", {"d": "e"}]},
+        "f": ["1", {"g": ""}],
+    }
+
+
+@pytest.mark.parametrize("text", ["a: 1\n---\nb: 2\n", "a: 1\n? [x, y]\n: c\n", "a: &x 1\nb: *x\n"])
+def test_yaml_that_no_calibration_needs_is_refused(tmp_path: Path, text: str) -> None:
+    (tmp_path / "rig.yml").write_text(text)
+    with pytest.raises(D2Error):
+        _ = Document(tmp_path / "rig.yml").content
+
+
+def test_a_name_that_stands_twice_is_named() -> None:
+    with pytest.raises(Unreadable, match="the name 'b' stands twice"):
+        parse_json('{"a": 1, "b": 2, "b": 3}', "x")
+    assert parse_toml("a.b = 1.5\n", "x") == {"a": {"b": 1.5}}
+
+
+FLAGS = """
+--d2.views-per-evaluation 1000000000 | --densify.scale 10000000000000000000000000 | --densify.lifetime 1e300
+--densify.spacing 10000000000000000000000000 | --densify.tau-u 10000000000000000000000000
+--prune.patience 1000000000 | --depth-loss.epsilon 10000000000000000000000000 | --depth-loss.epsilon 1e-320
+--prune.tau-u 1e-320 | --priors.stereo.patchmatch-sources 2000000000 | --priors.stereo.min-sources 2000000000
+--priors.mono-threads 1000000000 | --priors.stereo.max-pixels 1000000000000 | --priors.stereo.colmap-minutes 1e300
+--priors.stereo.reuse-block 1e25 | --priors.tau-c 1e300 | --priors.conflict-sigmas 1e-320
+--priors.align.epsilon 1e-320 | --priors.align.min-anchors 1e25 | --priors.depth-range 1e-320,1
+--priors.depth-range 1,1e300 | --backbone.sh-time-degree 10000000000000000000000000 | --backbone.position-rate 1e38
+--backbone.densify.budget 10000000000000000000 | --iterations 10000000000000000000 | --downscale 10000000000000000000
+--d2.prior-memory-mb 10000000000000000000 | --d2.finite-every 10000000000000000000
+"""
+
+
+def test_every_setting_has_both_bounds_on_the_command_line(recording: Path, tmp_path: Path, refused: Refused) -> None:
+    words = ["train", recording, "--train-cameras", "cam00,cam01", "--output", tmp_path / "run"]
+    for flags in FLAGS.strip().replace("\n", " | ").split(" | "):
+        name, value = flags.split()
+        said = refused(*words, name, value)
+        assert f"setting {name}" in said, said
+        assert " must be " in said, said
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_cache_that_cannot_be_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("D2_CACHE", "~no-user-of-this-name/x")
+    with pytest.raises(D2Error, match="there is no home folder of ~no-user"):
+        cache_folder()
+    with pytest.raises(Untrusted, match="/dev/null is no folder: set D2_CACHE") as refusal:
+        check_private(Path("/dev/null"))
+    assert "delete" not in str(refusal.value)
+
+
+def test_links_in_a_circle_are_one_sentence(recording: Path, tmp_path: Path, refused: Refused) -> None:
+    pytest.importorskip("av")
+    (tmp_path / "videos").mkdir()
+    for loop in (tmp_path / "loop", tmp_path / "videos" / "cam00.mp4"):
+        loop.symlink_to(loop)
+    calibration = ["--calibration", recording / "cameras.json"]
+    refused("import", tmp_path / "videos", *calibration, "--output", tmp_path / "out")
+    refused("import", tmp_path / "loop", *calibration, "--output", tmp_path / "out")
+    refused("train", recording, "--train-cameras", "cam00", "--output", tmp_path / "loop")
+    refused("export-recording", recording, "--format", "n3dv", "--output", tmp_path / "loop")
+
+
+def test_what_a_folder_of_videos_leaves_out_is_named(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    for name in ("a.mp4", "b.ts", "c.gif", "d.sdp", "e.txt"):
+        (tmp_path / name).write_text("")
+    assert [path.name for path in videos_below(tmp_path)] == ["a.mp4", "b.ts"]
+    assert "c.gif, d.sdp left out" in caplog.text
+
+
+def test_a_camera_that_is_named_twice_is_refused() -> None:
+    with pytest.raises(D2Error, match="--offsets names camera 'a' twice"):
+        by_camera("--offsets", ["a=0", "a=1"], ["a", "b"], finite, "NAME=FRAMES")
+    assert by_camera("--offsets", ["0", "a=1"], ["a", "b"], finite, "NAME=FRAMES") == {"a": 1.0, "b": 0.0}
+
+
+def command(*words: object, before: str = "") -> subprocess.CompletedProcess[str]:
+    """`d2` in a process of its own, after some code."""
+    code = f"import sys\n{before}\nfrom d2_plugin.__main__ import main\nsys.exit(main())"
+    line = [sys.executable, "-c", code, *map(str, words)]
+    return subprocess.run(line, capture_output=True, text=True, timeout=300, check=False)
+
+
+@pytest.mark.skipif(os.name == "nt", reason="file descriptors as POSIX has them")
+def test_closed_streams_are_no_fault_and_no_file_takes_their_place(tmp_path: Path) -> None:
+    seen = tmp_path / "seen"
+    look = f"import atexit, os\natexit.register(lambda: open({str(seen)!r}, 'w').write(os.readlink('/proc/self/fd/1')))"
+    close = "import os\nos.close(1)\nsys.stdout = sys.__stdout__ = None\n"
+    ended = command("compare", tmp_path / "nope", before=close + look)
+    assert ended.returncode == 2
+    assert ended.stderr.startswith("d2: ")
+    assert len(ended.stderr.splitlines()) == 1
+    if Path("/proc/self/fd").is_dir():
+        assert seen.read_text() == "/dev/null"
+
+
+INTERRUPTED = """
+import importlib.abc, signal
+class Stops(importlib.abc.MetaPathFinder):
+    def find_spec(self, name, path, target=None):
+        if name == "d2_plugin.commands.arguments.form":
+            signal.raise_signal(signal.SIGINT)
+sys.meta_path.insert(0, Stops())
+"""
+
+
+def test_ctrl_c_while_the_first_modules_are_imported_is_one_sentence() -> None:
+    ended = command("--help", before=INTERRUPTED)
+    assert (ended.returncode, ended.stderr) == (130, "d2: stopped: continue with the same command\n")
+
+
+def test_an_error_that_a_library_makes_of_ctrl_c_is_ctrl_c(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def answer(words: list[str]) -> str:
+        try:
+            signal.raise_signal(signal.SIGINT)
+        except KeyboardInterrupt:
+            raise AttributeError("module 'numpy' has no attribute 'logical_or'") from None
+        return ""
+
+    monkeypatch.setattr(cli, "_answer", answer)
+    assert main(["plan"]) == 130
+    assert capsys.readouterr().err == "d2: stopped: continue with the same command\n"
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_a_database_of_colmap_that_cannot_be_written_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("pycolmap")
+    from d2_plugin.priors.colmap import points
+    from d2_plugin.recordings.synthetic.room import synthetic_recording
+
+    def full(*_: object) -> None:
+        raise RuntimeError("No registered database factory succeeded.")
+
+    monkeypatch.setattr(points, "_triangulated", full)
+    room = synthetic_recording(cameras=2, held_out=0, frames=1, width=96, height=54, arc_degrees=15)
+    images = [room.image(name, 0) for name in room.cameras]
+    with pytest.raises(D2Error, match="COLMAP cannot triangulate in .* TMPDIR"):
+        points.triangulate(images, list(room.cameras.values()))
+
+
+def test_an_opaque_gaussian_of_spz_has_a_finite_logit(tmp_path: Path) -> None:
+    still = MovingGaussians(
+        torch.zeros(1, 3, dtype=torch.float64),
+        torch.tensor([[1.0, 0, 0, 1, 0, 1]], dtype=torch.float64),
+        torch.ones(1, dtype=torch.float64),
+        Harmonics(torch.zeros(1, 1, 3, dtype=torch.float64), 0),
+    )
+    write_spz(tmp_path / "a.spz", still, scales_and_rotations(still.covariances))
+    assert gzip.decompress((tmp_path / "a.spz").read_bytes())[16 + 9] == 254, "behind header and position"

@@ -1,0 +1,258 @@
+"""A trainer or a store of somebody's own that does something else than the contract says: named, never silent."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+from tiny import ALL_HOOKS, TinyStore, make_adapter, make_model, make_views
+from torch import Tensor
+
+from d2_plugin.adapters.yang4d import Yang4DAdapter
+from d2_plugin.config import D2Config, DensifyConfig, DepthLossConfig
+from d2_plugin.errors import D2Error
+from d2_plugin.plugin import D2Hooks
+from d2_plugin.protocol import DepthPrior, Points
+
+VIEWS = make_views()
+
+
+class ChangedStore(TinyStore):
+    """The tiny prior with something about it changed."""
+
+    def __init__(self, change: Callable[[DepthPrior], object]) -> None:
+        self.change = change
+
+    def prior(self, camera: str, frame: int) -> object:
+        return self.change(super().prior(camera, frame))
+
+
+def hooks(store: object = None, config: D2Config = ALL_HOOKS, adapter: object = None) -> D2Hooks:
+    return D2Hooks(config, adapter or make_adapter(make_model()), store or TinyStore())
+
+
+def verified(prior: DepthPrior, depth: float) -> DepthPrior:
+    """The prior with one verified pixel of that depth."""
+    changed = prior.depth.clone()
+    changed[3, 4] = depth
+    return prior._replace(depth=changed)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda prior: "x", "is a str, expected d2_plugin.protocol.DepthPrior or None"),
+        (lambda prior: tuple(prior), "is a tuple, expected"),
+        (lambda prior: prior._replace(labels=prior.labels[1:]), "has maps of several sizes"),
+        (lambda prior: prior._replace(sigma=prior.depth[1:]), "has maps of several sizes"),
+        (lambda prior: prior._replace(depth=prior.depth.numpy()), "has no depth as a map"),
+        (lambda prior: prior._replace(depth=prior.depth.long()), "has no depth as a map"),
+    ],
+)  # fmt: skip
+def test_a_prior_that_cannot_be_is_refused(change: Callable[[DepthPrior], object], says: str) -> None:
+    with pytest.raises(D2Error, match=f"the prior of camera cam0, frame 0 .*{says}"):
+        hooks(ChangedStore(change)).loss(1, VIEWS[0])
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        *((lambda prior, depth=depth: verified(prior, depth), "1 pixels whose label says that a depth is known")
+          for depth in (float("nan"), float("inf"), -3.0, 0.0)),
+        (lambda prior: prior._replace(labels=torch.full_like(prior.labels, 9)), "768 labels that are none of 0 to 5"),
+    ],
+)  # fmt: skip
+def test_pixels_of_a_prior_that_cannot_be_are_counted_once_per_camera(
+    change: Callable[[DepthPrior], object], says: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    d2 = hooks(ChangedStore(change))
+    for step in (1, 2):
+        d2.loss(step, [view for view in VIEWS if view.camera == "cam0"])
+    assert caplog.text.count(says) == 1
+
+
+@pytest.mark.parametrize("name", ["zeros", "mirrored", "scaled", "no last row", "K of zeros"])
+def test_a_pose_that_cannot_be_is_refused(name: str) -> None:
+    view, pose, K = VIEWS[0], torch.eye(4), VIEWS[0].K.clone()
+    if name == "zeros":
+        pose = torch.zeros(4, 4)
+    elif name == "mirrored":
+        pose[0, 0] = -1
+    elif name == "scaled":
+        pose[:3, :3] *= 1.1
+    elif name == "no last row":
+        pose[3] = 0
+    else:
+        K[2, 2] = 0
+    with pytest.raises(D2Error, match="is no rotation and shift, or the last row of it or K"):
+        hooks().loss(1, replace(view, T_camera_world=pose, K=K))
+
+
+def test_a_step_that_falls_repeats_or_differs_is_named_once(caplog: pytest.LogCaptureFixture) -> None:
+    def after(*calls: tuple[str, int]) -> None:
+        d2 = hooks(config=D2Config(depth_loss=DepthLossConfig()))
+        for name, step in calls:
+            d2.loss(step, VIEWS[0]) if name == "loss" else d2.step(step)
+
+    after(("loss", 1), ("loss", 1), ("step", 1), ("loss", 2), ("step", 2), ("step", 5), ("loss", 9))
+    assert "which rises" not in caplog.text
+    for wrong in (
+        [("loss", 5), ("step", 5), ("loss", 4)],
+        [("loss", 5), ("step", 5), ("loss", 5)],
+        [("step", 5), ("step", 5)],
+        [("loss", 5), ("step", 6)],
+        [("loss", 5), ("loss", 4)],
+    ):
+        caplog.clear()
+        after(*wrong, *wrong)
+        assert caplog.text.count("which rises from one to the next") == 1
+
+
+class Lazy(Yang4DAdapter):
+    """Inserts nothing, and says what it is told to."""
+
+    said: object = 0
+
+    def insert(self, points: Points) -> int:
+        return self.said  # type: ignore[return-value]
+
+
+@pytest.mark.parametrize("said", [0, 3, None, True])
+def test_an_insert_that_does_nothing_is_noticed(said: object, caplog: pytest.LogCaptureFixture) -> None:
+    adapter = Lazy(make_model())
+    adapter.said = said
+    d2 = hooks(config=D2Config(densify=DensifyConfig(start=1, every=1)), adapter=adapter)
+    d2.loss(1, VIEWS[0])
+    if said == 0 and said is not True:
+        d2.step(1)
+        assert "insert() of the backbone added none of" in caplog.text
+    else:
+        with pytest.raises(D2Error, match=r"insert\(\) was given .* and returned .*return how many were added"):
+            d2.step(1)
+
+
+@contextmanager
+def default(dtype: torch.dtype) -> Iterator[None]:
+    torch.set_default_dtype(dtype)
+    try:
+        yield
+    finally:
+        torch.set_default_dtype(torch.float32)
+
+
+@pytest.mark.parametrize(
+    "around",
+    [
+        lambda: default(torch.float64),
+        lambda: default(torch.float16),
+        lambda: torch.device("meta"),
+        torch.inference_mode,
+    ],
+    ids=["float64", "float16", "meta", "inference"],
+)
+def test_what_torch_does_to_every_tensor_is_refused_where_d2_cannot_work_with_it(around: Callable) -> None:
+    d2 = hooks()
+    for call in (lambda: d2.loss(1, VIEWS[0]), lambda: d2.step(1)):
+        with around(), pytest.raises(D2Error, match="D2 needs float32 as the default dtype"):
+            call()
+
+
+def test_two_threads_at_once_are_refused() -> None:
+    inside, go_on = threading.Event(), threading.Event()
+
+    class Waiting(TinyStore):
+        def prior(self, camera: str, frame: int) -> DepthPrior:
+            inside.set()
+            go_on.wait(20)
+            return super().prior(camera, frame)
+
+    d2 = hooks(Waiting())
+    first = threading.Thread(target=d2.loss, args=(1, VIEWS[0]))
+    first.start()
+    assert inside.wait(20)
+    try:
+        with pytest.raises(D2Error, match="two threads use one D2Hooks at once"):
+            d2.loss(1, VIEWS[1])
+    finally:
+        go_on.set()
+        first.join()
+    d2.step(1)
+
+
+FORKED = """
+import os, torch
+torch.set_num_threads(2)
+from tiny import make_views
+from test_trainer_mistakes import hooks
+d2 = hooks()
+def work(step):
+    torch.randn(3_000_000).exp().sum()
+    d2.loss(step, make_views()[step % 6])
+    d2.step(step)
+work(1)
+child = os.fork()
+work(2)
+if child == 0:
+    os._exit(0)
+os._exit(os.waitpid(child, 0)[1] and 3)
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
+def test_a_child_that_was_forked_after_use_with_threads_does_not_hang() -> None:
+    here = Path(__file__).parent
+    paths = os.pathsep.join([str(here), str(here.parent), *filter(None, [os.environ.get("PYTHONPATH")])])
+    environment = os.environ | {"PYTHONPATH": paths, "OMP_NUM_THREADS": "2"}
+    process = subprocess.Popen([sys.executable, "-c", FORKED], env=environment, start_new_session=True)
+    try:
+        assert process.wait(120) == 0
+    finally:
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
+
+
+class Filmed(Yang4DAdapter):
+    """An adapter that knows the images of its cameras."""
+
+    images: dict[tuple[str, int], Tensor]
+
+    def view(self, camera: SimpleNamespace) -> object:
+        return camera.view
+
+    def image(self, camera: SimpleNamespace) -> Tensor:
+        return camera.original_image
+
+
+def scene(moved: float, noise: float) -> Tensor:
+    """An image [3, H, W]: something bright before a texture, moved by some pixels."""
+    y, x = torch.meshgrid(torch.arange(24.0), torch.arange(32.0), indexing="ij")
+    image = 0.4 + 0.2 * torch.sin(x / 3 + torch.arange(3)[:, None, None]) * torch.cos(y / 4)
+    image = torch.where(((x - 10 - moved) ** 2 + (y - 12) ** 2 < 25), 0.95, image)
+    return (image + noise * torch.randn(image.shape, generator=torch.Generator().manual_seed(0))).clamp(0, 1)
+
+
+@pytest.mark.parametrize(("moved", "noise", "gain", "warned"), [(0, 0.02, 0.8, False), (9, 0, 1, True)])
+def test_a_prior_of_another_frame_is_named(
+    moved: float, noise: float, gain: float, warned: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    def made(prior: DepthPrior) -> DepthPrior:
+        return prior._replace(colors=(scene(0, 0) * 255).byte().permute(1, 2, 0))
+
+    d2 = hooks(ChangedStore(made), adapter=Filmed(make_model()))
+    camera = SimpleNamespace(view=VIEWS[0], original_image=gain * scene(moved, noise))
+    with caplog.at_level(logging.WARNING):
+        d2.loss(1, camera)
+        d2.step(1)
+        d2.loss(2, camera)
+    assert caplog.text.count("does the key name another frame?") == int(warned)
