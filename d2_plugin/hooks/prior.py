@@ -5,7 +5,8 @@ from __future__ import annotations
 import logging
 import math
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Literal, NamedTuple, Protocol
 
 import torch
@@ -13,7 +14,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from d2_plugin.errors import D2Error
-from d2_plugin.protocol import CameraRecord, DepthPrior, Label, View
+from d2_plugin.protocol import CameraRecord, DepthPrior, Label, View, call_optional
 
 log = logging.getLogger(__name__)
 
@@ -21,7 +22,8 @@ log = logging.getLogger(__name__)
 class Store(Protocol):
     """What the loader needs of a prior store (d2_plugin.store.store.PriorStore).
 
-    Where it also has `camera(camera, frame) -> CameraRecord | None`, views are checked against it.
+    Where it also has `camera(camera, frame) -> CameraRecord | None`, views are checked against it. Where it has
+    `halfway(camera, frame) -> (next frame, DepthPrior) | None`, instants between those that are trained are known.
     """
 
     def prior(self, camera: str, frame: int) -> DepthPrior | None: ...
@@ -163,8 +165,9 @@ class PriorLoader:
     ) -> None:
         """`memory_mb`: what the priors that are kept may take; the one in use is kept whatever it takes."""
         self.store, self.keep_bytes, self._rename, self.believe = store, memory_mb << 20, rename, believe
-        self._kept: OrderedDict[tuple[str, int], DepthPrior | None] = OrderedDict()
-        self._known: dict[tuple[str, int], KnownMaps] = {}
+        self._kept: OrderedDict[tuple[str, float], DepthPrior | None] = OrderedDict()  # frame + 0.5: halfway to the next
+        self._known: dict[tuple[str, float], KnownMaps] = {}
+        self._next: dict[tuple[str, int], int] = {}
         self._cameras = CameraCheck()
         self._without: set[str] = set()
         self.named = False
@@ -194,13 +197,38 @@ class PriorLoader:
             )  # fmt: skip
         if prior is not None:
             self._check(view, prior)
-            prior = believed(DepthPrior._make(None if t is None else t.to(view.K.device) for t in prior), self.believe)
-            prior = _usable(prior)
+            prior = self.usable(_on(view.K.device, prior))
+        self._keep(key, prior)
+        return prior
+
+    def usable(self, prior: DepthPrior) -> DepthPrior:
+        """What of a prior is believed and has a depth."""
+        return _usable(believed(prior, self.believe))
+
+    def halfway(self, view: View, instants: Sequence[View]) -> tuple[View, DepthPrior] | None:
+        """The view halfway to the next of a camera's `instants`, and what is known of it, as it is stored.
+
+        None where the store has none, or the next instant has not been seen yet.
+        """
+        key = (view.camera, view.frame + 0.5)
+        if key not in self._kept:
+            stored = call_optional(self.store, "halfway", view.camera, view.frame)
+            if stored is None:
+                return None
+            self._next[view.camera, view.frame] = stored[0]
+            self._keep(key, _on(view.K.device, stored[1]))
+        self._kept.move_to_end(key)
+        frame, prior = self._next[view.camera, view.frame], self._kept[key]
+        following = next((other for other in instants if other.frame == frame), None)
+        if following is None or prior is None or prior.depth.shape != (view.height, view.width):
+            return None
+        return replace(view, time=(view.time + following.time) / 2), prior
+
+    def _keep(self, key: tuple[str, float], prior: DepthPrior | None) -> None:
         self._kept[key] = prior
         while len(self._kept) > 1 and self._bytes() > self.keep_bytes:
             dropped, _ = self._kept.popitem(last=False)
             self._known.pop(dropped, None)
-        return prior
 
     def known(self, view: View) -> KnownMaps | None:
         """What is known of the depth of the view's pixels, or None where nothing is of any."""
@@ -228,6 +256,10 @@ class PriorLoader:
         record = describe(view.camera, view.frame) if describe is not None else None
         if record is not None:
             self._cameras.check(view, record, prior.depth)
+
+
+def _on(device: torch.device, prior: DepthPrior) -> DepthPrior:
+    return DepthPrior._make(None if map_ is None else map_.to(device) for map_ in prior)
 
 
 def _usable(prior: DepthPrior) -> DepthPrior:

@@ -50,6 +50,12 @@ class RenamedStore:
         """D* of one view, or None where there is none; a camera that the export does not have is refused."""
         return self._of_source("prior", camera, frame)
 
+    def halfway(self, camera: str, frame: int) -> tuple[int, DepthPrior] | None:
+        """See `PriorStore.halfway`; None where the export leaves out the next frame."""
+        halfway = self._of_source("halfway", camera, frame)
+        exported = {source: number for number, source in self.frames.items()}
+        return (exported[halfway[0]], halfway[1]) if halfway is not None and halfway[0] in exported else None
+
     def camera(self, camera: str, frame: int) -> Any:
         """The camera that one prior was built for, or None where the store does not say."""
         return self._of_source("camera", camera, frame)

@@ -4,6 +4,7 @@
     STORE/priors/CAMERA/FRAME.npy        structured [H, W]: depth uint16 (logarithmic, 0 = empty), label,
                                          sigma uint8 (logarithmic, 0 = 0, 255 = infinite), RGB uint8
     STORE/priors/CAMERA/FRAME.json       record: a, b, gap, status, shares, settings, hashes, depth range, checksum
+    STORE/between/CAMERA/FRAME.npy, .json  the same halfway from a frame to the next one (`d2_plugin.priors.between`)
     STORE/cache/...                      stereo and monocular maps, so that other fusion settings cost seconds
     STORE/cameras/NAME+NAME/...          a store of its own for the priors of other cameras of the same recording
 
@@ -53,6 +54,8 @@ class PriorStore:
         self.path, self.about = Path(path), about
         self.cameras, self.frames = tuple(cameras), tuple(frames)
         self.entries = EntryFolder(self.path / "priors")
+        self.between = EntryFolder(self.path / "between")
+        """The instants halfway from a frame to the next one, by the earlier frame."""
 
     @classmethod
     @checked_arguments
@@ -150,13 +153,15 @@ class PriorStore:
             D2Error: an unknown camera, or an array that does not match the checksum of its record.
         """
         entry = self._entry(camera, frame)
-        if entry is None:
-            return None
-        codes = entry.array(PRIOR_DTYPE)
-        depth = DepthRange(*entry.record["depth_range"]).decode(codes["depth"])
-        labels, colors = np.ascontiguousarray(codes["label"]), np.ascontiguousarray(codes["color"])
-        sigma = SIGMA[codes["sigma"]]
-        return DepthPrior(*(torch.from_numpy(map_) for map_ in (depth, labels, colors, sigma)))
+        return None if entry is None else _decoded(entry)
+
+    def halfway(self, camera: str, frame: int) -> tuple[int, DepthPrior] | None:
+        """The next frame, and what the camera would see halfway there; None where the store has no such instants.
+
+        Pixels whose motion is not known are labelled as conflicts, and only what moves has a depth.
+        """
+        entry = self.between.find(camera, frame)
+        return None if entry is None else (entry.record["next"], _decoded(entry))
 
     @checked_arguments
     def record(self, camera: str, frame: int) -> dict[str, Any] | None:
@@ -176,8 +181,15 @@ class PriorStore:
         """Whether an intact prior built from exactly these inputs is there; a damaged one is named in the log."""
         return self.entries.find_current(camera, frame, key) is not None
 
-    def write(self, camera: str, frame: int, prior: FusedPrior, record: dict[str, Any]) -> None:
-        """Store all maps of one prior and its record.
+    def write(
+        self,
+        camera: str,
+        frame: int,
+        prior: FusedPrior,
+        record: dict[str, Any],
+        entries: EntryFolder | None = None,
+    ) -> None:
+        """Store all maps of one prior and its record, among the priors or among `between`.
 
         Raises:
             D2Error: no colours or those of another size, depth that is not finite or negative, sigma that is NaN or
@@ -188,7 +200,8 @@ class PriorStore:
         codes = np.empty(prior.depth.shape, PRIOR_DTYPE)
         codes["depth"], codes["label"], codes["color"] = depth_range.encode(prior.depth), prior.labels, prior.colors
         codes["sigma"] = encode_sigma(prior.sigma)
-        self.entries.write(camera, frame, codes, {**record, "depth_range": [depth_range.near, depth_range.far]})
+        about = {**record, "depth_range": [depth_range.near, depth_range.far]}
+        (entries or self.entries).write(camera, frame, codes, about)
 
     @contextmanager
     def building(self, root: Path) -> Iterator[None]:
@@ -213,6 +226,13 @@ class PriorStore:
         if camera not in self.cameras:
             raise D2Error(f"{unknown_name('camera of the prior store', camera, self.cameras)}; {_OTHER_NAMES}")
         return self.entries.find(camera, frame)
+
+
+def _decoded(entry: Entry) -> DepthPrior:
+    codes = entry.array(PRIOR_DTYPE)
+    depth = DepthRange(*entry.record["depth_range"]).decode(codes["depth"])
+    labels, colors = np.ascontiguousarray(codes["label"]), np.ascontiguousarray(codes["color"])
+    return DepthPrior(*(torch.from_numpy(map_) for map_ in (depth, labels, colors, SIGMA[codes["sigma"]])))
 
 
 _OTHER_NAMES = (

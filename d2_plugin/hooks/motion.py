@@ -1,0 +1,80 @@
+"""Supervision of motion: what the cameras would have seen halfway between two instants (an addition to the paper).
+
+Images alone say nothing of the time between them: Gaussians that fade in and out, one set for each instant, reproduce
+every trained image, and between two instants show both. The prior knows where each surface went, and so what lies
+halfway (`d2_plugin.priors.between`). That image supervises whatever moves the Gaussians, a space-time covariance, a
+deformation network, polynomials, through `slice_at`; and `densify` inserts what is missing there.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from typing import Annotated
+
+import torch
+from torch import Tensor
+
+from d2_plugin.gaussians.photometric import photometric_loss
+from d2_plugin.hooks.hook import Context, Hook, HookConfig
+from d2_plugin.protocol import Label, View, call_optional
+from d2_plugin.rasterizer import rasterize
+from d2_plugin.settings import Every, Range, Share, Steps
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class MotionConfig(HookConfig):
+    """Supervision halfway between instants."""
+
+    start: Steps = 1
+    """First step at which it is added."""
+    stop: Steps | None = None
+    """First step at which it is no longer added; none: to the end."""
+    every: Every = 1
+    """Steps between additions. Each costs a render with gradients."""
+    weight: Annotated[float, Range(0, 1e6)] = 1.0
+    """Weight beside the trainer's own photometric loss."""
+    ssim_weight: Share = 0.2
+    """Share of D-SSIM in it; the rest is L1."""
+    insert: bool = True
+    """Whether `densify` also inserts what moves at instants halfway."""
+
+
+class Motion(Hook):
+    """Adds the photometric loss halfway from each view of the present step to the camera's next instant."""
+
+    config: MotionConfig
+
+    def __init__(self, config: MotionConfig) -> None:
+        super().__init__(config)
+        self._colorless = False
+
+    def loss(self, context: Context) -> Tensor | None:
+        """The mean over the step's views that have a known halfway, times the weight."""
+        if self.config.weight == 0 or self._colorless:
+            return None
+        terms = [term for view in context.views if (term := self._term(context, view)) is not None]
+        return self.config.weight * torch.stack(terms).mean() if terms else None
+
+    def _term(self, context: Context, view: View) -> Tensor | None:
+        halfway = context.prior.halfway(view, context.instants(view.camera))
+        if halfway is None:
+            return None
+        between, prior = halfway
+        known = prior.labels != Label.CONFLICT
+        backbone = context.backbone
+        splats = backbone.slice_at(between)
+        colors = call_optional(backbone, "colors", between, splats)
+        if colors is None:
+            log.warning("motion supervises nothing: the backbone has no `colors`, see d2_plugin.protocol.Backbone")
+            self._colorless = True
+            return None
+        render = rasterize(splats, colors, between, backbone.settings)
+        image = prior.colors.to(render.color) / 255 if prior.colors is not None else render.color.detach()
+        # A background that is not known shows what the image shows.
+        unknown = render._replace(color=render.color + (1 - render.alpha)[..., None] * image)
+        color = call_optional(backbone, "behind", render, between, default=unknown).color
+        target = torch.where(known[..., None], image, color.detach())
+        return photometric_loss(color, target, self.config.ssim_weight)
