@@ -17,7 +17,7 @@ from torch import Tensor
 
 from d2_plugin.gaussians.photometric import photometric_loss
 from d2_plugin.hooks.hook import Context, Hook, HookConfig
-from d2_plugin.protocol import Label, View, call_optional
+from d2_plugin.protocol import Backbone, DepthPrior, Label, View, call_optional
 from d2_plugin.rasterizer import rasterize
 from d2_plugin.settings import Every, Range, Share, Steps
 
@@ -43,7 +43,7 @@ class MotionConfig(HookConfig):
 
 
 class Motion(Hook):
-    """Adds the photometric loss halfway from each view of the present step to the camera's next instant."""
+    """Adds the photometric loss halfway from each view of the present step to the same camera's next instant."""
 
     config: MotionConfig
 
@@ -52,29 +52,25 @@ class Motion(Hook):
         self._colorless = False
 
     def loss(self, context: Context) -> Tensor | None:
-        """The mean over the step's views that have a known halfway, times the weight."""
+        """The weight times the mean over the views of which something is known halfway; None where there are none."""
         if self.config.weight == 0 or self._colorless:
             return None
-        terms = [term for view in context.views if (term := self._term(context, view)) is not None]
-        return self.config.weight * torch.stack(terms).mean() if terms else None
+        pairs = [context.prior.halfway(view, context.instants(view.camera)) for view in context.views]
+        terms = [self._term(context.backbone, *pair) for pair in pairs if pair is not None]
+        known = [term for term in terms if term is not None]
+        return self.config.weight * torch.stack(known).mean() if known else None
 
-    def _term(self, context: Context, view: View) -> Tensor | None:
-        halfway = context.prior.halfway(view, context.instants(view.camera))
-        if halfway is None:
-            return None
-        between, prior = halfway
-        known = prior.labels != Label.CONFLICT
-        backbone = context.backbone
-        splats = backbone.slice_at(between)
-        colors = call_optional(backbone, "colors", between, splats)
-        if colors is None:
+    def _term(self, backbone: Backbone, view: View, prior: DepthPrior) -> Tensor | None:
+        splats = backbone.slice_at(view)
+        colors = call_optional(backbone, "colors", view, splats)
+        if colors is None or prior.colors is None:
             log.warning("motion supervises nothing: the backbone has no `colors`, see d2_plugin.protocol.Backbone")
             self._colorless = True
             return None
-        render = rasterize(splats, colors, between, backbone.settings)
-        image = prior.colors.to(render.color) / 255 if prior.colors is not None else render.color.detach()
+        render = rasterize(splats, colors, view, backbone.settings)
+        image = prior.colors.to(render.color) / 255
         # A background that is not known shows what the image shows.
         unknown = render._replace(color=render.color + (1 - render.alpha)[..., None] * image)
-        color = call_optional(backbone, "behind", render, between, default=unknown).color
-        target = torch.where(known[..., None], image, color.detach())
-        return photometric_loss(color, target, self.config.ssim_weight)
+        color = call_optional(backbone, "behind", render, view, default=unknown).color
+        moved = (prior.labels != Label.CONFLICT)[..., None]
+        return photometric_loss(color, torch.where(moved, image, color.detach()), self.config.ssim_weight)

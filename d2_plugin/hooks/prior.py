@@ -165,7 +165,8 @@ class PriorLoader:
     ) -> None:
         """`memory_mb`: what the priors that are kept may take; the one in use is kept whatever it takes."""
         self.store, self.keep_bytes, self._rename, self.believe = store, memory_mb << 20, rename, believe
-        self._kept: OrderedDict[tuple[str, float], DepthPrior | None] = OrderedDict()  # frame + 0.5: halfway to the next
+        # By camera and frame; frame + 0.5 is halfway to the next.
+        self._kept: OrderedDict[tuple[str, float], DepthPrior | None] = OrderedDict()
         self._known: dict[tuple[str, float], KnownMaps] = {}
         self._next: dict[tuple[str, int], int] = {}
         self._cameras = CameraCheck()

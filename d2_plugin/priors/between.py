@@ -48,10 +48,11 @@ EXACT = 0.15
 """Largest sigma of the depth that places a region in the world."""
 
 
-def build_between(store: PriorStore, progress: Callable[[int, int], None] | None = None) -> int:
+def build_between(store: PriorStore, progress: Callable[[int], None] | None = None) -> int:
     """Make what is missing of the instants between those of a store; returns how many views were made now.
 
-    Nothing is made while a prior is missing, or where there are fewer than three frames.
+    Nothing is made while a prior is missing, or where there are fewer than three frames. `progress` is called with the
+    number of views that are done.
 
     Raises:
         CannotWrite: the disk is full, broken or not ours.
@@ -67,7 +68,7 @@ def build_between(store: PriorStore, progress: Callable[[int, int], None] | None
     even = len({second - first for first, second in pairs}) == 1
     flights = [flight for camera in cameras for interval in camera.flights for flight in interval if flight is not None]
     acceleration = common_acceleration(flights) if even else None
-    done, total = 0, len(cameras) * len(pairs)
+    done = 0
     with store.building(store.path):
         for camera in cameras:
             for index, (first, second) in enumerate(pairs):
@@ -76,7 +77,7 @@ def build_between(store: PriorStore, progress: Callable[[int, int], None] | None
                 store.write(camera.name, first, halfway, record, store.between)
                 done += 1
                 if progress is not None:
-                    progress(done, total)
+                    progress(done)
     return done
 
 
@@ -229,7 +230,7 @@ def _depths(sides: Sequence[_Side]) -> tuple[np.ndarray, np.ndarray, np.ndarray]
     return depth, sigma, labels
 
 
-def _place(pixels: np.ndarray, prior: DepthPrior, camera: CameraRecord, shape: tuple[int, int]) -> np.ndarray | None:
+def _place(pixels: np.ndarray, prior: DepthPrior, camera: CameraRecord, shape: tuple[int, ...]) -> np.ndarray | None:
     """The world point [3] at the middle of some pixels (flat indices), at the median of their depth."""
     rows, columns = np.unravel_index(pixels, shape)
     depth = prior.depth.numpy()[rows, columns]

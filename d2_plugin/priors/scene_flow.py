@@ -89,7 +89,7 @@ class Region:
     end: np.ndarray  # int [m], at the later one
     shift: np.ndarray  # [2] pixels (columns, rows)
     cost: float
-    shape: tuple[int, int]
+    shape: tuple[int, ...]
 
     @property
     def fast(self) -> bool:
@@ -109,7 +109,7 @@ def regions(
     """
     fronts = foreground(earlier, still), foreground(later, still)
     lost = fronts[0] & ~followed(earlier, later, flow, back), fronts[1] & ~followed(later, earlier, back, flow)
-    found: list[Region] = []
+    matched: list[Region] = []
     for images, masks, unexplained, forwards in (
         ((earlier, later), fronts, lost[0], True),
         ((later, earlier), fronts[::-1], lost[1], False),
@@ -121,10 +121,10 @@ def regions(
                 continue
             back_again, _ = _match(*images[::-1], landed, masks[0])
             if np.abs(shift + back_again).sum() <= 3:
-                ends = [np.flatnonzero(part) for part in (mask, landed)]
-                region = Region(*(ends if forwards else ends[::-1]), shift if forwards else -shift, cost, mask.shape)
-                found.append(region)
-    return sorted(found, key=lambda region: -region.cost)
+                here, there = np.flatnonzero(mask), np.flatnonzero(landed)
+                start, end, way = (here, there, shift) if forwards else (there, here, -shift)
+                matched.append(Region(start, end, way, cost, still.shape[:2]))
+    return sorted(matched, key=lambda region: -region.cost)
 
 
 def _pieces(front: np.ndarray, unexplained: np.ndarray) -> Iterator[np.ndarray]:
@@ -172,7 +172,7 @@ def _match(image: np.ndarray, other: np.ndarray, mask: np.ndarray, front: np.nda
 def _moved(mask: np.ndarray, shift: np.ndarray) -> np.ndarray:
     """The mask shifted by whole pixels."""
     cv2 = opencv("scene flow")
-    moving = np.float32([[1, 0, shift[0]], [0, 1, shift[1]]])
+    moving = np.array([[1, 0, shift[0]], [0, 1, shift[1]]], np.float32)
     moved: np.ndarray = cv2.warpAffine(mask.astype(np.uint8), moving, mask.shape[::-1], flags=cv2.INTER_NEAREST) > 0
     return moved
 

@@ -90,7 +90,8 @@ class PriorSettings(Settings):
         each camera for itself, depth read at pixels."""
         align = AlignSettings(residual="absolute", epsilon=0.01, local_correction=False, across=False)
         changes["stereo"] = replace(changes.get("stereo", StereoSettings()), between_pixels=False)
-        return cls(uncertainty=False, hanging_limit=0.0, agreement=0.0, far=False, between=False, align=align, **changes)
+        changes |= {"uncertainty": False, "hanging_limit": 0.0, "agreement": 0.0, "far": False, "between": False}
+        return cls(align=align, **changes)
 
     @classmethod
     def from_dict(cls, table: Mapping[str, Any], where: str = "priors") -> PriorSettings:
