@@ -15,7 +15,6 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
-from d2_plugin.gaussians.photometric import photometric_loss
 from d2_plugin.hooks.hook import Context, Hook, HookConfig
 from d2_plugin.protocol import Backbone, DepthPrior, Label, View, call_optional
 from d2_plugin.rasterizer import rasterize
@@ -61,6 +60,8 @@ class Motion(Hook):
         return self.config.weight * torch.stack(known).mean() if known else None
 
     def _term(self, backbone: Backbone, view: View, prior: DepthPrior) -> Tensor | None:
+        from d2_plugin.gaussians.photometric import photometric_loss  # a trainer without this hook needs none of it
+
         splats = backbone.slice_at(view)
         colors = call_optional(backbone, "colors", view, splats)
         if colors is None or prior.colors is None:

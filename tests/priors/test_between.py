@@ -1,4 +1,4 @@
-"""Scene flow and the instants halfway: a recording of flat things at a known depth, whose truth halfway is drawn too."""
+"""Scene flow and the instants halfway, in a recording of flat things whose truth halfway is drawn as well."""
 
 from __future__ import annotations
 
