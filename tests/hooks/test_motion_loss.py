@@ -61,7 +61,7 @@ class TestLoss:
     def test_of_the_render_itself_at_that_time_it_is_next_to_nothing(self, backbone: str) -> None:
         adapter = make_adapter(make_model(backbone=backbone))
         image = (255 * shown(adapter, 0.25)).round().clamp(0, 255).byte()
-        assert float(loss_of(adapter, Halfway(image))) < 1e-3
+        assert float(loss_of(adapter, Halfway(image)).detach()) < 1e-3
 
     def test_it_moves_gaussians_and_has_the_weight_that_was_asked_for(self, backbone: str) -> None:
         adapter = make_adapter(make_model(backbone=backbone))
@@ -74,11 +74,11 @@ class TestLoss:
 
     def test_where_motion_is_not_known_the_image_counts_for_nothing(self, backbone: str) -> None:
         adapter, store = make_adapter(make_model(backbone=backbone)), Halfway()
-        before = float(loss_of(adapter, store))
+        before = float(loss_of(adapter, store).detach())
         store.image[:, -WIDTH // 4 :] = 255
-        assert float(loss_of(adapter, store)) == before
+        assert float(loss_of(adapter, store).detach()) == before
         store.image[:, 0] = 255
-        assert float(loss_of(adapter, store)) != before
+        assert float(loss_of(adapter, store).detach()) != before
 
 
 def test_its_gradient_is_that_of_differences_in_time_and_place() -> None:
