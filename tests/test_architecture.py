@@ -35,7 +35,7 @@ ROOMS = {
     "recordings": "ground",
     "store": "ground",
     "priors": "ground recordings store",
-    "hooks": "ground rasterizer",
+    "hooks": "ground rasterizer (gaussians)",
     "config": "ground hooks",
     "plugin": "ground config hooks (store)",
     "runs": "ground config plugin hooks priors store recordings gaussians rasterizer",

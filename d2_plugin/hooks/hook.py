@@ -103,7 +103,7 @@ class Context:
     def halfway(self) -> list[Surveyed]:
         """What lies halfway from each view of `evaluation` to the camera's next instant, where it is to be known."""
         seen = [surveyed.view for surveyed in self.evaluation] if self.inserts_halfway else []
-        pairs = [pair for view in seen if (pair := self.prior.halfway(view, self.instants(view.camera))) is not None]
+        pairs = [pair for view in seen if (pair := self.prior.underway(view, self.instants(view.camera))) is not None]
         return [self._survey(view, self.prior.usable(prior)) for view, prior in pairs]
 
     @torch.no_grad()

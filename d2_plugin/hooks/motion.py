@@ -1,9 +1,10 @@
-"""Supervision of motion: what the cameras would have seen halfway between two instants (an addition to the paper).
+"""Supervision of motion: what the cameras would have seen between two instants (an addition to the paper).
 
 Images alone say nothing of the time between them: Gaussians that fade in and out, one set for each instant, reproduce
 every trained image, and between two instants show both. The prior knows where each surface went, and so what lies
-halfway (`d2_plugin.priors.between`). That image supervises whatever moves the Gaussians, a space-time covariance, a
-deformation network, polynomials, through `slice_at`; and `densify` inserts what is missing there.
+1 to 3 quarters of the way (`d2_plugin.priors.between`). That image supervises whatever moves the Gaussians, a
+space-time covariance, a deformation network, polynomials, through `slice_at`; and `densify` inserts what is missing
+halfway.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class MotionConfig(HookConfig):
-    """Supervision halfway between instants."""
+    """Supervision between instants."""
 
     start: Steps = 1
     """First step at which it is added."""
@@ -42,7 +43,7 @@ class MotionConfig(HookConfig):
 
 
 class Motion(Hook):
-    """Adds the photometric loss halfway from each view of the present step to the same camera's next instant."""
+    """Adds the photometric loss between each view of the present step and the same camera's next instant."""
 
     config: MotionConfig
 
@@ -51,10 +52,11 @@ class Motion(Hook):
         self._colorless = False
 
     def loss(self, context: Context) -> Tensor | None:
-        """The weight times the mean over the views of which something is known halfway; None where there are none."""
+        """The weight times the mean over the views after which something is known; None where there are none."""
         if self.config.weight == 0 or self._colorless:
             return None
-        pairs = [context.prior.halfway(view, context.instants(view.camera)) for view in context.views]
+        quarter = 1 + context.step // self.config.every % 3
+        pairs = [context.prior.underway(view, context.instants(view.camera), quarter) for view in context.views]
         terms = [self._term(context.backbone, *pair) for pair in pairs if pair is not None]
         known = [term for term in terms if term is not None]
         return self.config.weight * torch.stack(known).mean() if known else None

@@ -23,7 +23,7 @@ class Store(Protocol):
     """What the loader needs of a prior store (d2_plugin.store.store.PriorStore).
 
     Where it also has `camera(camera, frame) -> CameraRecord | None`, views are checked against it. Where it has
-    `halfway(camera, frame) -> (next frame, DepthPrior) | None`, instants between those that are trained are known.
+    `underway(camera, frame, quarter) -> (next frame, DepthPrior) | None`, instants between the trained ones are known.
     """
 
     def prior(self, camera: str, frame: int) -> DepthPrior | None: ...
@@ -206,14 +206,14 @@ class PriorLoader:
         """What of a prior is believed and has a depth."""
         return _usable(believed(prior, self.believe))
 
-    def halfway(self, view: View, instants: Sequence[View]) -> tuple[View, DepthPrior] | None:
-        """The view halfway to the next of a camera's `instants`, and what is known of it, as it is stored.
+    def underway(self, view: View, instants: Sequence[View], quarter: int = 2) -> tuple[View, DepthPrior] | None:
+        """The view 1, 2 or 3 quarters of the way to the next of a camera's `instants`, and what is stored of it.
 
         None where the store has none, or the next instant has not been seen yet.
         """
-        key = (view.camera, view.frame + 0.5)
+        key = (view.camera, view.frame + quarter / 4)
         if key not in self._kept:
-            stored = call_optional(self.store, "halfway", view.camera, view.frame)
+            stored = call_optional(self.store, "underway", view.camera, view.frame, quarter)
             if stored is None:
                 return None
             self._next[view.camera, view.frame] = stored[0]
@@ -223,7 +223,7 @@ class PriorLoader:
         following = next((other for other in instants if other.frame == frame), None)
         if following is None or prior is None or prior.depth.shape != (view.height, view.width):
             return None
-        return replace(view, time=(view.time + following.time) / 2), prior
+        return replace(view, time=view.time + quarter / 4 * (following.time - view.time)), prior
 
     def _keep(self, key: tuple[str, float], prior: DepthPrior | None) -> None:
         self._kept[key] = prior

@@ -1,6 +1,6 @@
-"""The instants between: what each training camera would have seen halfway from one of its instants to the next.
+"""The instants between: what each training camera would have seen 1, 2 and 3 quarters of the way to its next instant.
 
-Every pixel goes half of its way, from the earlier instant forwards and from the later one back; fast regions lie in
+Every pixel goes its part of the way, from the earlier instant forwards and from the later one back; fast regions lie in
 front of moving pixels, and those in front of still ones. Where both accounts have colours that differ, motion is not
 known and the pixel counts for nothing. D* comes along where something moves, so that surfaces can be inserted there.
 
@@ -29,9 +29,9 @@ from d2_plugin.priors.scene_flow import (
 from d2_plugin.protocol import CameraRecord, DepthPrior, Label
 from d2_plugin.store.files import hash_of
 from d2_plugin.store.maps import FusedPrior, empty_prior
-from d2_plugin.store.store import PriorStore
+from d2_plugin.store.store import QUARTERS, PriorStore
 
-VERSION = 1
+VERSION = 2
 """Of what is made from the same priors; raise it when that changes."""
 
 MOVES = 0.6
@@ -49,7 +49,7 @@ EXACT = 0.15
 
 
 def build_between(store: PriorStore, progress: Callable[[int], None] | None = None) -> int:
-    """Make what is missing of the instants between those of a store; returns how many views were made now.
+    """Make what is missing of the instants between those of a store; after how many views they were made now.
 
     Nothing is made while a prior is missing, or where there are fewer than three frames. `progress` is called with the
     number of views that are done.
@@ -62,7 +62,10 @@ def build_between(store: PriorStore, progress: Callable[[int], None] | None = No
         return 0
     key = hash_of(VERSION, [[camera, frame, record["key"]] for (camera, frame), record in records.items() if record])
     pairs = list(zip(store.frames, store.frames[1:]))
-    if all(store.between.find_current(camera, first, key) for camera in store.cameras for first, _ in pairs):
+    entries = [
+        (folder, camera, first) for folder in store.between.values() for camera in store.cameras for first, _ in pairs
+    ]
+    if all(folder.find_current(camera, first, key) for folder, camera, first in entries):
         return 0
     cameras = [_Camera(store, name) for name in store.cameras]
     even = len({second - first for first, second in pairs}) == 1
@@ -72,9 +75,9 @@ def build_between(store: PriorStore, progress: Callable[[int], None] | None = No
     with store.building(store.path):
         for camera in cameras:
             for index, (first, second) in enumerate(pairs):
-                halfway = camera.halfway(index, acceleration)
-                record = {"key": key, "next": second, "shares": halfway.shares()}
-                store.write(camera.name, first, halfway, record, store.between)
+                for quarter, seen in camera.underway(index, acceleration).items():
+                    record = {"key": key, "next": second, "shares": seen.shares()}
+                    store.write(camera.name, first, seen, record, store.between[quarter])
                 done += 1
                 if progress is not None:
                     progress(done)
@@ -97,27 +100,31 @@ class _Camera:
             self.regions.append(regions(earlier, later, self.still, *_flows(earlier, later)))
         self.flights = [[self._flight(index, region) for region in each] for index, each in enumerate(self.regions)]
 
-    def halfway(self, index: int, acceleration: np.ndarray | None) -> FusedPrior:
-        """The view halfway through an interval; nothing of it is known where too much of the image changes."""
+    def underway(self, index: int, acceleration: np.ndarray | None) -> dict[int, FusedPrior]:
+        """The view at each quarter of an interval; nothing of it is known where too much of the image changes."""
         priors = [self._prior(frame) for frame in self.store.frames[index : index + 2]]
         images = [prior.colors.numpy() for prior in priors if prior.colors is not None]
         changed = (np.abs(np.subtract(*images, dtype=np.int16)) > CHANGED).any(-1)
         if changed.mean() > MOST_CHANGED:
             unknown = np.full(changed.shape, Label.CONFLICT, np.uint8)
-            return replace(empty_prior(changed.shape), labels=unknown, colors=images[0])
+            return dict.fromkeys(QUARTERS, replace(empty_prior(changed.shape), labels=unknown, colors=images[0]))
         for image in images:
             changed |= foreground(image, self.still)
         bends = [self._bend(flight, acceleration) for flight in self.flights[index]]
         flows = _flows(*images)
-        sides = []
-        for flow, which, prior in zip(flows, ("start", "end"), priors):
-            steps, layer = flow / 2, (np.hypot(flow[..., 0], flow[..., 1]) > MOVES).astype(np.uint8)
-            for region, bend in zip(self.regions[index], bends):
-                pixels = np.unravel_index(getattr(region, which), region.shape)
-                steps[pixels] = (region.shift if which == "start" else -region.shift) / 2 + bend
-                layer[pixels] = 2
-            sides.append(_Side(prior, steps, layer))
-        return _composed(sides, changed)
+        made = {}
+        for quarter in QUARTERS:
+            sides, part = [], quarter / 4
+            for flow, which, prior, share in zip(flows, ("start", "end"), priors, (part, 1 - part)):
+                steps, layer = share * flow, (np.hypot(flow[..., 0], flow[..., 1]) > MOVES).astype(np.uint8)
+                for region, bend in zip(self.regions[index], bends):
+                    pixels = np.unravel_index(getattr(region, which), region.shape)
+                    way = region.shift if which == "start" else -region.shift
+                    steps[pixels] = share * way + 4 * part * (1 - part) * bend
+                    layer[pixels] = 2
+                sides.append(_Side(prior, steps, layer, 1 - share))
+            made[quarter] = _composed(sides, changed)
+        return made
 
     def _flight(self, index: int, region: Region) -> Flight | None:
         """The region's way in the world, with that of the same region in the intervals beside; None without depth."""
@@ -158,11 +165,12 @@ class _Camera:
 
 
 class _Side(NamedTuple):
-    """One of the two instants: what its pixels are, and how far each goes until halfway."""
+    """One of the two instants: what its pixels are, how far each goes, and how much it counts for being near."""
 
     prior: DepthPrior
     steps: np.ndarray  # [H, W, 2] pixels
     layer: np.ndarray  # [H, W] index into LAYERS
+    weight: float
 
 
 def _flows(earlier: np.ndarray, later: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -170,8 +178,8 @@ def _flows(earlier: np.ndarray, later: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def _composed(sides: Sequence[_Side], changed: np.ndarray) -> FusedPrior:
-    """The image halfway from both instants' accounts, with the depth of what moves; `changed` [H, W] says where."""
-    accounts = [_account(side) for side in sides]
+    """The image from both instants' accounts, with the depth of what moves; `changed` [H, W] says where."""
+    accounts = [2 * side.weight * _account(side) for side in sides]
     both = np.minimum(accounts[0][..., 3], accounts[1][..., 3]) > 1e-2 * LAYERS[0]
     colors = [account[..., :3] / np.maximum(account[..., 3:], 1e-9) for account in accounts]
     differ = both & (np.abs(colors[0] - colors[1]).max(-1) > CONTRADICTS)
@@ -190,7 +198,7 @@ def _composed(sides: Sequence[_Side], changed: np.ndarray) -> FusedPrior:
 
 
 def _account(side: _Side) -> np.ndarray:
-    """Weighted colours and their weight [H, W, 4] of one side's pixels halfway, by linear splatting."""
+    """Weighted colours and their weight [H, W, 4] of one side's pixels there, by linear splatting."""
     height, width = side.layer.shape
     rows, columns = np.nonzero(side.layer)
     assert side.prior.colors is not None

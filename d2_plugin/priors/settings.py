@@ -60,7 +60,7 @@ class PriorSettings(Settings):
     far: bool = True
     """Find sky and what lies beyond any parallax (`dual` alone); off, as in the paper, they are like all others."""
     between: bool = True
-    """Make what the cameras would have seen halfway from instant to instant, for the hook `motion`."""
+    """Make what the cameras would have seen between their instants, for the hook `motion`."""
     depth_range: tuple[Positive, Positive] | None = None
     """Near and far of the stereo search, world units; by default from sparse points, the data set, or the baselines."""
     mono_onnx: str | None = None

@@ -71,7 +71,7 @@ def contact_sheet(
         if (prior := store.prior(camera, frame)) is not None
     ]
     for camera, frame in ((camera, frame) for frame in chosen for camera in store.cameras):
-        halfway = store.halfway(camera, frame)
+        halfway = store.underway(camera, frame, 2)
         if halfway is not None and halfway[1].colors is not None:
             unknown = float((halfway[1].labels == Label.CONFLICT).float().mean())
             about = f"camera {camera}, halfway from frame {frame} to {halfway[0]}: motion not known at {unknown:.1%}"

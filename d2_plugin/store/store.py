@@ -4,7 +4,8 @@
     STORE/priors/CAMERA/FRAME.npy        structured [H, W]: depth uint16 (logarithmic, 0 = empty), label,
                                          sigma uint8 (logarithmic, 0 = 0, 255 = infinite), RGB uint8
     STORE/priors/CAMERA/FRAME.json       record: a, b, gap, status, shares, settings, hashes, depth range, checksum
-    STORE/between/CAMERA/FRAME.npy, .json  the same halfway from a frame to the next one (`d2_plugin.priors.between`)
+    STORE/between/QUARTER/CAMERA/FRAME.npy, .json  the same 1 to 3 quarters of the way from a frame to the next one
+                                         (`d2_plugin.priors.between`)
     STORE/cache/...                      stereo and monocular maps, so that other fusion settings cost seconds
     STORE/cameras/NAME+NAME/...          a store of its own for the priors of other cameras of the same recording
 
@@ -42,6 +43,9 @@ FORMAT = 4
 STORE = Kind("prior store", FORMAT, "build the priors anew in another folder")
 """The table store.json."""
 
+QUARTERS = (1, 2, 3)
+"""Of the way from a frame to the next one, at which something is known between them."""
+
 OTHERS = "cameras"
 """Folder of a store that holds the stores of other sets of cameras."""
 
@@ -54,8 +58,8 @@ class PriorStore:
         self.path, self.about = Path(path), about
         self.cameras, self.frames = tuple(cameras), tuple(frames)
         self.entries = EntryFolder(self.path / "priors")
-        self.between = EntryFolder(self.path / "between")
-        """The instants halfway from a frame to the next one, by the earlier frame."""
+        self.between = {quarter: EntryFolder(self.path / "between" / f"{quarter}") for quarter in QUARTERS}
+        """The instants so many quarters of the way from a frame to the next one, by the earlier frame."""
 
     @classmethod
     @checked_arguments
@@ -155,12 +159,13 @@ class PriorStore:
         entry = self._entry(camera, frame)
         return None if entry is None else _decoded(entry)
 
-    def halfway(self, camera: str, frame: int) -> tuple[int, DepthPrior] | None:
-        """The next frame, and what the camera would see halfway there; None where the store has no such instants.
+    def underway(self, camera: str, frame: int, quarter: int) -> tuple[int, DepthPrior] | None:
+        """The next frame, and what the camera would see 1, 2 or 3 quarters of the way there; None where the store has
+        no such instants.
 
         Pixels whose motion is not known are labelled as conflicts, and only what moves has a depth.
         """
-        entry = self.between.find(camera, frame)
+        entry = self.between[quarter].find(camera, frame)
         return None if entry is None else (entry.record["next"], _decoded(entry))
 
     @checked_arguments

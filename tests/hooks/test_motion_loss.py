@@ -29,8 +29,8 @@ class Halfway(TinyStore):
         self.image = torch.full((HEIGHT, WIDTH, 3), 90, dtype=torch.uint8) if image is None else image
         self.unknown = unknown
 
-    def halfway(self, camera: str, frame: int) -> tuple[int, DepthPrior] | None:
-        """From the first instant to the second."""
+    def underway(self, camera: str, frame: int, quarter: int) -> tuple[int, DepthPrior] | None:
+        """From the first instant to the second, as if nothing moved from quarter to quarter."""
         if frame > 0:
             return None
         labels = torch.zeros(HEIGHT, WIDTH, dtype=torch.uint8)

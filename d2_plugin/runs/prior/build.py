@@ -52,7 +52,7 @@ def build_priors_for(
         )
     if scene.prior_settings.between and scene.plan.uses("temporal") and shard is None:
         store = PriorStore.described(PriorStore.located(folder, scene.train_cameras))
-        with progress_bar("halfway", len(store.cameras) * (len(store.frames) - 1)) as bar:
+        with progress_bar("between", len(store.cameras) * (len(store.frames) - 1)) as bar:
             build_between(store, bar.update)
     return summary
 
