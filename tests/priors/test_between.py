@@ -157,7 +157,7 @@ class TestHalfway:
             assert np.abs(image[inner] - (240, 150, 20)).max() < 20
             assert np.median(np.abs(image - wall())[~around]) == 0
             twice = (image[..., 0] - image[..., 2] > 120) & ~around & (halfway.labels.numpy() != Label.CONFLICT)
-            assert twice.sum() < 0.1 * inner.sum()
+            assert twice.sum() < 0.1 * around.sum()
             assert np.isclose(depth[inner], BALL_DEPTH, rtol=1e-3).mean() > 0.9
             np.testing.assert_array_equal(depth > 0, np.isin(halfway.labels, (Label.VERIFIED,)))
 
