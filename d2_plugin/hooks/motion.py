@@ -23,6 +23,9 @@ from d2_plugin.settings import Every, Range, Share, Steps
 
 log = logging.getLogger(__name__)
 
+ORDER = (2, 1, 2, 3)
+"""Quarters of the way in turn: halfway, farthest from what is trained, twice as often."""
+
 
 @dataclass(frozen=True)
 class MotionConfig(HookConfig):
@@ -55,7 +58,7 @@ class Motion(Hook):
         """The weight times the mean over the views after which something is known; None where there are none."""
         if self.config.weight == 0 or self._colorless:
             return None
-        quarter = 1 + context.step // self.config.every % 3
+        quarter = ORDER[context.step // self.config.every % len(ORDER)]
         pairs = [context.prior.underway(view, context.instants(view.camera), quarter) for view in context.views]
         terms = [self._term(context.backbone, *pair) for pair in pairs if pair is not None]
         known = [term for term in terms if term is not None]
