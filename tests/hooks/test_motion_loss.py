@@ -39,15 +39,15 @@ class Halfway(TinyStore):
         return 1, DepthPrior(depth, labels, self.image, torch.where(labels == Label.VERIFIED, 0.01, torch.inf))
 
 
-def context_of(adapter: object, store: object, views: list[View], known: list[View]) -> Context:
+def context_of(adapter: object, store: object, views: list[View], known: list[View], step: int = 2) -> Context:
     def of(camera: str) -> list[View]:
         return [view for view in known if view.camera == camera]
 
-    return Context(1, adapter, views, PriorLoader(store), torch.Generator(), tuple, of)
+    return Context(step, adapter, views, PriorLoader(store), torch.Generator(), tuple, of)
 
 
-def loss_of(adapter: object, store: object | None = None, **changes: float) -> Tensor | None:
-    context = context_of(adapter, store or Halfway(), [FIRST], [FIRST, SECOND])
+def loss_of(adapter: object, store: object | None = None, step: int = 2, **changes: float) -> Tensor | None:
+    context = context_of(adapter, store or Halfway(), [FIRST], [FIRST, SECOND], step)
     return Motion(MotionConfig(**changes)).loss(context)
 
 
@@ -60,8 +60,9 @@ def shown(adapter: object, time: float) -> Tensor:
 class TestLoss:
     def test_of_the_render_itself_at_that_time_it_is_next_to_nothing(self, backbone: str) -> None:
         adapter = make_adapter(make_model(backbone=backbone))
-        image = (255 * shown(adapter, 0.25)).round().clamp(0, 255).byte()
-        assert float(loss_of(adapter, Halfway(image)).detach()) < 1e-3
+        for step, time in ((1, 0.125), (2, 0.25), (3, 0.375), (4, 0.25)):
+            image = (255 * shown(adapter, time)).round().clamp(0, 255).byte()
+            assert float(loss_of(adapter, Halfway(image), step).detach()) < 1e-3
 
     def test_it_moves_gaussians_and_has_the_weight_that_was_asked_for(self, backbone: str) -> None:
         adapter = make_adapter(make_model(backbone=backbone))
