@@ -53,8 +53,10 @@ class WatchedModel(Resizing, Observer, Generic[Model]):
         return dict(trained_tensors(self.model))
 
     def behind(self, render: Render, view: View) -> Render:
-        """The render with the model's background, if it has one."""
-        return render if self.model.background is None else self.model.background.behind(render, view)
+        """The render with the model's background, if it has one, and in the colours of the view's camera."""
+        if self.model.background is not None:
+            render = self.model.background.behind(render, view)
+        return render if self.model.appearance is None else self.model.appearance.seen_by(view.camera, render)
 
     def remove(self, mask: Tensor) -> None:
         """Delete the rows where `mask` [N] is True."""

@@ -56,7 +56,7 @@ class MlpSettings(Settings):
     """Neurons of a hidden layer. Official: 256, on a GPU."""
     depth: Annotated[int, Range(1, 64)] = 4
     """Hidden layers, with a skip connection to the middle one. Official: 8."""
-    rate: LearningRate = 2e-4
+    rate: LearningRate = 2e-3
     """Learning rate of the network at the first step. Official: 8e-4."""
 
 

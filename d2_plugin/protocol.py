@@ -232,11 +232,13 @@ class Backbone(Protocol):
     ``active(step) -> bool``
         False while the hooks must wait (stages, warm-up); changes nothing.
     ``colors(view, splats) -> Tensor``
-        RGB [M, 3], 0 or more, of what `slice_at(view)` returned: the live viewer shows them, and grey without.
+        RGB [M, 3], 0 or more, of what `slice_at(view)` returned, differentiable: the live viewer shows them, and grey
+        without; the hook `motion` supervises them.
     ``trained() -> Mapping[str, Tensor]``
         the tensors that are trained, by name: training stops where one is not finite, and names it.
     ``behind(render, view) -> Render``
-        the render with the backbone's own background where the Gaussians leave some of a ray.
+        the render with the backbone's own background where the Gaussians leave some of a ray, in the colours of the
+        view's camera where exposures are learnt.
     """
 
     settings: RasterSettings

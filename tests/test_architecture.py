@@ -34,7 +34,7 @@ ROOMS = {
     "recordings": "ground",
     "store": "ground",
     "priors": "ground recordings store",
-    "hooks": "ground rasterizer store",
+    "hooks": "ground rasterizer store (gaussians)",
     "config": "ground hooks",
     "plugin": "ground config hooks (store)",
     "runs": "ground config plugin hooks priors store recordings gaussians rasterizer",

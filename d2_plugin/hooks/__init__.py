@@ -26,6 +26,7 @@ from typing import NamedTuple
 from d2_plugin.hooks.densify import Densify, DensifyConfig
 from d2_plugin.hooks.depth_loss import DepthLoss, DepthLossConfig
 from d2_plugin.hooks.hook import Context, Hook, HookConfig, Surveyed, Window
+from d2_plugin.hooks.motion import Motion, MotionConfig
 from d2_plugin.hooks.prior import PriorLoader
 from d2_plugin.hooks.prune import Prune, PruneConfig
 
@@ -39,6 +40,8 @@ __all__ = [
     "Hook",
     "HookConfig",
     "HookRow",
+    "Motion",
+    "MotionConfig",
     "PriorLoader",
     "Prune",
     "PruneConfig",
@@ -60,5 +63,6 @@ HOOKS: dict[str, HookRow] = {
     "densify": HookRow(DensifyConfig, Densify, edits_structure=True),
     "prune": HookRow(PruneConfig, Prune, edits_structure=True),
     "depth_loss": HookRow(DepthLossConfig, DepthLoss, edits_structure=False),
+    "motion": HookRow(MotionConfig, Motion, edits_structure=False),
 }
 """Hooks by name, in the order in which they run."""

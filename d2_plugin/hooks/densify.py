@@ -187,22 +187,33 @@ class Densify(Hook):
         """Points from the under-reconstructed pixels of the evaluated views, within the budget."""
         room = self.config.max_gaussians - len(context.backbone)
         inserted: list[Points] = []
-        for surveyed in context.evaluation:
+        for surveyed, lives in (
+            *((surveyed, self._lifetimes(surveyed.view, context)) for surveyed in context.evaluation),
+            *((surveyed, self._interval_everywhere(surveyed.view, context)) for surveyed in context.halfway),
+        ):
             budget = min(self.config.budget_per_view, room - sum(len(p.positions) for p in inserted))
             if budget > 0:
-                points = self._propose(surveyed, inserted, budget, context)
+                points = self._propose(surveyed, inserted, budget, context.generator, lives)
                 inserted += [points] if len(points.positions) else []
         if not inserted:
             return None
         return Edit(insert=Points.joined(inserted))
 
-    def _propose(self, surveyed: Surveyed, earlier: list[Points], budget: int, context: Context) -> Points:
-        """New points of one view that no existing Gaussian and no point of an earlier view already stands for."""
+    def _propose(
+        self,
+        surveyed: Surveyed,
+        earlier: list[Points],
+        budget: int,
+        generator: torch.Generator,
+        lifetimes: Tensor | None,
+    ) -> Points:
+        """New points of one view that no existing Gaussian and no point of an earlier view already stands for;
+        `lifetimes` [H, W] is how long they may live."""
         config, view, prior = self.config, surveyed.view, surveyed.prior
         check_splats(surveyed.splats, len(surveyed.splats.means), inserting=True)
         depth, valid = rendered_depth(surveyed.survey.depth_sum, surveyed.survey.alpha, config.tau_v)
         region = under_reconstructed(depth, valid, prior.depth, prior.support, self._tau_u(prior))
-        pixels = shuffled_pixels(region, context.generator)
+        pixels = shuffled_pixels(region, generator)
         column, row = pixels.unbind(-1)
         target = prior.depth[row, column]
         positions = back_project(view, pixels, target)
@@ -214,7 +225,6 @@ class Densify(Hook):
         focal = torch.sqrt(view.K[0, 0] * view.K[1, 1])
         scales = config.scale * spacing * target / focal
         times, opacities = torch.full_like(target, view.time), torch.full_like(target, config.opacity)
-        lifetimes = self._lifetimes(view, context)
         lifetimes = None if lifetimes is None else lifetimes[row, column]
         return Points(positions, colors, times, scales, opacities, lifetimes).select(free)
 
@@ -222,6 +232,13 @@ class Densify(Hook):
         """How long a new Gaussian may live at each pixel [H, W], infinite where nothing moves; None: not known."""
         intervals = None if self.config.lifetime is None else self._motion.intervals(view, context)
         return None if self.config.lifetime is None or intervals is None else self.config.lifetime * intervals
+
+    def _interval_everywhere(self, view: View, context: Context) -> Tensor | None:
+        """The same [H, W] halfway between instants, where whatever has a depth moves."""
+        interval = _interval(context.instants(view.camera))
+        like = view.T_camera_world
+        lifetime = self.config.lifetime
+        return None if lifetime is None else like.new_full((view.height, view.width), lifetime * interval)
 
     def _tau_u(self, prior: DepthPrior) -> Tensor:
         """The relative depth error [H, W] that counts as under-reconstructed, by how exact each pixel is."""

@@ -90,17 +90,24 @@ class Context:
     """The views to evaluate when structure is edited: a stratified sample of all training views."""
     instants: Callable[[str], Sequence[View]] = _none_known
     """The views of a camera that were trained on so far, in the order in which they were first seen."""
+    inserts_halfway: bool = False
+    """Whether `halfway` is evaluated as well."""
 
     @cached_property
     def evaluation(self) -> list[Surveyed]:
         """The sampled views that have a prior, surveyed without gradients."""
-        return [s for view in self.sample() if (s := self._survey(view)) is not None]
+        pairs = [(view, self.prior(view)) for view in self.sample()]
+        return [self._survey(view, prior) for view, prior in pairs if prior is not None]
+
+    @cached_property
+    def halfway(self) -> list[Surveyed]:
+        """What lies halfway from each view of `evaluation` to the camera's next instant, where it is to be known."""
+        seen = [surveyed.view for surveyed in self.evaluation] if self.inserts_halfway else []
+        pairs = [pair for view in seen if (pair := self.prior.underway(view, self.instants(view.camera))) is not None]
+        return [self._survey(view, self.prior.believed(prior)) for view, prior in pairs]
 
     @torch.no_grad()
-    def _survey(self, view: View) -> Surveyed | None:
-        prior = self.prior(view)
-        if prior is None:
-            return None
+    def _survey(self, view: View, prior: DepthPrior) -> Surveyed:
         splats = self.backbone.slice_at(view)
         check_splats(splats, len(self.backbone), inserting=False)
         check_device(splats, view)

@@ -5,8 +5,9 @@ from __future__ import annotations
 import logging
 import math
 from collections import OrderedDict
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 from typing import Literal, NamedTuple, Protocol
 
 import torch
@@ -15,7 +16,7 @@ from torch import Tensor
 
 from d2_plugin.errors import D2Error
 from d2_plugin.hooks.expected import check_colors, check_prior
-from d2_plugin.protocol import CameraRecord, DepthPrior, Label, View
+from d2_plugin.protocol import CameraRecord, DepthPrior, Label, View, call_optional
 from d2_plugin.store.maps import UNKNOWN, CodedPrior
 
 log = logging.getLogger(__name__)
@@ -24,8 +25,9 @@ log = logging.getLogger(__name__)
 class Store(Protocol):
     """What the loader needs of a prior store (d2_plugin.store.store.PriorStore).
 
-    Where it also has `camera(camera, frame) -> CameraRecord | None`, views are checked against it; where it has
-    `coded(camera, frame) -> CodedPrior | None`, that is kept in memory in the place of the prior.
+    Where it also has `camera(camera, frame) -> CameraRecord | None`, views are checked against it. Where it has
+    `underway(camera, frame, quarter) -> (next frame, DepthPrior) | None`, instants between the trained ones are known.
+    Where it has `coded` and `coded_underway`, their `CodedPrior` is kept in memory in the place of the prior.
     """
 
     def prior(self, camera: str, frame: int) -> DepthPrior | None: ...
@@ -217,7 +219,9 @@ class PriorLoader:
     ) -> None:
         """`memory_mb`: what the priors that are kept may take; the one in use is kept whatever it takes."""
         self.store, self.keep_bytes, self._rename, self.believe = store, memory_mb << 20, rename, believe
-        self._kept: OrderedDict[Key, Kept | None] = OrderedDict()
+        # By camera and frame; frame + 0.5 is halfway to the next.
+        self._kept: OrderedDict[tuple[str, float], Kept | None] = OrderedDict()
+        self._next: dict[Key, int] = {}
         self._bytes = 0
         self._reading: dict[Key, Future[Kept | None]] = {}
         self._thread: ThreadPoolExecutor | None = None
@@ -287,7 +291,7 @@ class PriorLoader:
             read = CodedPrior(read, None)
         return Kept.of(read, self.believe, self._pin)
 
-    def _keep(self, key: Key, kept: Kept | None) -> None:
+    def _keep(self, key: tuple[str, float], kept: Kept | None) -> None:
         self._kept[key] = kept
         self._bytes += 0 if kept is None else kept.bytes
         while len(self._kept) > 1 and self._bytes > self.keep_bytes:
@@ -305,6 +309,33 @@ class PriorLoader:
                 "camera %s has no prior at frame %d and is trained without D2 there; the prior has cameras %s",
                 view.camera, view.frame, ", ".join(map(str, getattr(self.store, "cameras", ()))) or "unknown",
             )  # fmt: skip
+
+    def underway(self, view: View, instants: Sequence[View], quarter: int = 2) -> tuple[View, DepthPrior] | None:
+        """The view 1, 2 or 3 quarters of the way to the next of a camera's `instants`, and what is stored of it.
+
+        None where the store has none, or the next instant has not been seen yet.
+        """
+        key = (view.camera, view.frame + quarter / 4)
+        if key not in self._kept:
+            name = "coded_underway" if hasattr(self.store, "coded_underway") else "underway"
+            stored = call_optional(self.store, name, view.camera, view.frame, quarter)
+            if stored is None:
+                return None
+            self._next[view.camera, view.frame] = stored[0]
+            coded = stored[1] if isinstance(stored[1], CodedPrior) else CodedPrior(stored[1], None)
+            self._keep(key, Kept(coded, KnownMaps.of(coded.codes, UNKNOWN if coded.range is not None else math.inf)))
+        self._kept.move_to_end(key)
+        frame, kept = self._next[view.camera, view.frame], self._kept[key]
+        following = next((other for other in instants if other.frame == frame), None)
+        if following is None or kept is None or kept.known.kind.shape != (view.height, view.width):
+            return None
+        between = replace(view, time=view.time + quarter / 4 * (following.time - view.time))
+        return between, kept.prior(view.K.device)
+
+    def believed(self, prior: DepthPrior) -> DepthPrior:
+        """What of a prior is believed."""
+        kept = believed(prior, self.believe)
+        return kept if kept.reliability is None else kept._replace(reliability=kept.reliability * kept.support)
 
     def _check(self, view: View, kept: Kept) -> None:
         height, width = kept.known.kind.shape

@@ -59,6 +59,8 @@ class PriorSettings(Settings):
     paper: they neither confirm nor contradict a mono-only pixel (`d2_plugin.priors.evidence`)."""
     far: bool = True
     """Find sky and what lies beyond any parallax (`dual` alone); off, as in the paper, they are like all others."""
+    between: bool = True
+    """Make what the cameras would have seen between their instants, for the hook `motion`."""
     depth_range: tuple[Positive, Positive] | None = None
     """Near and far of the stereo search, world units; by default from sparse points, the data set, or the baselines."""
     mono_onnx: str | None = None
@@ -88,7 +90,8 @@ class PriorSettings(Settings):
         each camera for itself, depth read at pixels."""
         align = AlignSettings(residual="absolute", epsilon=0.01, local_correction=False, across=False)
         changes["stereo"] = replace(changes.get("stereo", StereoSettings()), between_pixels=False)
-        return cls(uncertainty=False, hanging_limit=0.0, agreement=0.0, far=False, align=align, **changes)
+        changes |= {"uncertainty": False, "hanging_limit": 0.0, "agreement": 0.0, "far": False, "between": False}
+        return cls(align=align, **changes)
 
     @classmethod
     def from_dict(cls, table: Mapping[str, Any], where: str = "priors") -> PriorSettings:

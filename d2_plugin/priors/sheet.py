@@ -49,6 +49,8 @@ def contact_sheet(
 ) -> Path:
     """Write a PNG with one row per camera and frame: image | D* (near is red) | labels | sigma.
 
+    Below them, what the cameras would see halfway to the next frames, where the store has it.
+
     Args:
         store: the priors.
         recording: where the images come from.
@@ -68,6 +70,12 @@ def contact_sheet(
         for camera in store.cameras
         if (prior := store.prior(camera, frame)) is not None
     ]
+    for camera, frame in ((camera, frame) for frame in chosen for camera in store.cameras):
+        halfway = store.underway(camera, frame, 2)
+        if halfway is not None and halfway[1].colors is not None:
+            unknown = float((halfway[1].labels == Label.CONFLICT).float().mean())
+            about = f"camera {camera}, halfway from frame {frame} to {halfway[0]}: motion not known at {unknown:.1%}"
+            rows.append(_row(cv2, halfway[1].colors.numpy(), halfway[1], about, width))
     if not rows:
         raise D2Error(f"{store.path} has no prior at frames {', '.join(map(str, chosen))}: build them first")
     titles = np.concatenate([_line(cv2, title, width, 0.32) for title in TITLES], axis=1)

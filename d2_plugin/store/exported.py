@@ -54,17 +54,30 @@ class RenamedStore:
         """The same as it is stored, where the store has that."""
         return self._of_source("coded" if hasattr(self.store, "coded") else "prior", camera, frame)
 
+    def underway(self, camera: str, frame: int, quarter: int) -> tuple[int, DepthPrior] | None:
+        """See `PriorStore.underway`; None where the export leaves out the next frame."""
+        return self._next_exported(self._of_source("underway", camera, frame, quarter))
+
+    def coded_underway(self, camera: str, frame: int, quarter: int) -> Any:
+        """The same as it is stored, where the store has that."""
+        name = "coded_underway" if hasattr(self.store, "coded_underway") else "underway"
+        return self._next_exported(self._of_source(name, camera, frame, quarter))
+
+    def _next_exported(self, underway: Any) -> Any:
+        exported = {source: number for number, source in self.frames.items()}
+        return (exported[underway[0]], underway[1]) if underway is not None and underway[0] in exported else None
+
     def camera(self, camera: str, frame: int) -> Any:
         """The camera that one prior was built for, or None where the store does not say."""
         return self._of_source("camera", camera, frame)
 
-    def _of_source(self, what: str, camera: str, frame: int) -> Any:
+    def _of_source(self, what: str, camera: str, frame: int, *further: int) -> Any:
         if camera not in self.sources:
             raise unknown_name("camera of the export", camera, self.sources)
         if frame not in self.frames or camera not in self.cameras:
             return None  # a camera of the recording that the prior was not built for is trained without one
         method = getattr(self.store, what, None)
-        return None if method is None else method(self.sources[camera], self.frames[frame])
+        return None if method is None else method(self.sources[camera], self.frames[frame], *further)
 
 
 def opened(prior: str, exported: str | None) -> Any:

@@ -4,6 +4,8 @@
     STORE/priors/CAMERA/FRAME.npy        structured [H, W]: depth uint16 (logarithmic, 0 = empty), label,
                                          sigma uint8 (logarithmic, 0 = 0, 255 = infinite), RGB uint8
     STORE/priors/CAMERA/FRAME.json       record: a, b, gap, status, shares, settings, hashes, depth range, checksum
+    STORE/between/QUARTER/CAMERA/FRAME.npy, .json  the same 1 to 3 quarters of the way from a frame to the next one
+                                         (`d2_plugin.priors.between`)
     STORE/cache/...                      stereo and monocular maps, so that other fusion settings cost seconds
     STORE/cameras/NAME+NAME/...          a store of its own for the priors of other cameras of the same recording
 
@@ -49,6 +51,9 @@ FORMAT = 4
 STORE = Kind("prior store", FORMAT, "build the priors anew in another folder")
 """The table store.json."""
 
+QUARTERS = (1, 2, 3)
+"""Of the way from a frame to the next one, at which something is known between them."""
+
 OTHERS = "cameras"
 """Folder of a store that holds the stores of other sets of cameras."""
 
@@ -62,6 +67,8 @@ class PriorStore:
         self.cameras, self.frames = tuple(cameras), tuple(frames)
         self.entries = EntryFolder(self.path / "priors")
         self._intact: set[Path] = set()
+        self.between = {quarter: EntryFolder(self.path / "between" / f"{quarter}") for quarter in QUARTERS}
+        """The instants so many quarters of the way from a frame to the next one, by the earlier frame."""
 
     @classmethod
     @checked_arguments
@@ -165,8 +172,23 @@ class PriorStore:
     def coded(self, camera: str, frame: int) -> CodedPrior | None:
         """The same, not decoded: what a training keeps in memory. The checksum is compared at the first reading."""
         entry = self._entry(camera, frame)
-        if entry is None:
-            return None
+        return None if entry is None else self._coded(entry)
+
+    def underway(self, camera: str, frame: int, quarter: int) -> tuple[int, DepthPrior] | None:
+        """The next frame, and what the camera would see 1, 2 or 3 quarters of the way there; None where the store has
+        no such instants.
+
+        Pixels whose motion is not known are labelled as conflicts, and only what moves has a depth.
+        """
+        coded = self.coded_underway(camera, frame, quarter)
+        return None if coded is None else (coded[0], coded[1].decoded())
+
+    def coded_underway(self, camera: str, frame: int, quarter: int) -> tuple[int, CodedPrior] | None:
+        """The same, not decoded."""
+        entry = self.between[quarter].find(camera, frame)
+        return None if entry is None else (entry.record["next"], self._coded(entry))
+
+    def _coded(self, entry: Entry) -> CodedPrior:
         stored = entry.array(PRIOR_DTYPE, intact=entry.path in self._intact)
         self._intact.add(entry.path)
         return CodedPrior.of(stored, DepthRange(*entry.record["depth_range"]))
@@ -189,8 +211,15 @@ class PriorStore:
         """Whether an intact prior built from exactly these inputs is there; a damaged one is named in the log."""
         return self.entries.find_current(camera, frame, key) is not None
 
-    def write(self, camera: str, frame: int, prior: FusedPrior, record: dict[str, Any]) -> None:
-        """Store all maps of one prior and its record.
+    def write(
+        self,
+        camera: str,
+        frame: int,
+        prior: FusedPrior,
+        record: dict[str, Any],
+        entries: EntryFolder | None = None,
+    ) -> None:
+        """Store all maps of one prior and its record, among the priors or among `between`.
 
         Raises:
             D2Error: no colours or those of another size, depth that is not finite or negative, sigma that is NaN or
@@ -201,7 +230,8 @@ class PriorStore:
         codes = np.empty(prior.depth.shape, PRIOR_DTYPE)
         codes["depth"], codes["label"], codes["color"] = depth_range.encode(prior.depth), prior.labels, prior.colors
         codes["sigma"] = encode_sigma(prior.sigma)
-        self.entries.write(camera, frame, codes, {**record, "depth_range": [depth_range.near, depth_range.far]})
+        about = {**record, "depth_range": [depth_range.near, depth_range.far]}
+        (entries or self.entries).write(camera, frame, codes, about)
 
     @contextmanager
     def building(self, root: Path) -> Iterator[None]:

@@ -53,6 +53,9 @@ PRESETS: dict[str, Preset] = {
         Preset("no_densification", "w/o Densification", _without("densify")),
         Preset("no_pruning", "w/o Pruning", _without("prune")),
         Preset("no_rgbd", "w/o RGB-D", _without("depth_loss")),
+        Preset("no_motion", "w/o motion", _without("motion")),
+        Preset("motion_by_loss", "motion by the loss only", overrides={"motion": {"insert": False}}),
+        Preset("motion_by_insertion", "motion at insertion only", overrides={"motion": {"weight": 0.0}}),
         Preset("full", "D²-4DGS"),
         Preset("opacity_only", "Opacity only", overrides={"prune": {"lambda_e": 0.0}}),
         Preset("depth_only", "Depth only", overrides={"prune": {"lambda_e": 1.0}}),
@@ -70,6 +73,7 @@ TABLES: dict[str, tuple[str, ...]] = {
         *("backbone", "mono_only", "mvs_only", "dual_unaligned", "dual_unverified"),
         *("no_densification", "no_pruning", "no_rgbd", "full", "full_d2_densification_only"),
     ),
+    "motion": ("no_motion", "motion_by_insertion", "motion_by_loss", "full"),
     "pruning": ("no_pruning", "opacity_only", "depth_only", "full"),
     "main": ("backbone", "full"),
 }

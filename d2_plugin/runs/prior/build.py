@@ -10,9 +10,11 @@ from typing import Any
 import numpy as np
 
 from d2_plugin.errors import D2Error
+from d2_plugin.priors.between import build_between
 from d2_plugin.priors.build import PriorSummary, build_priors
 from d2_plugin.progress import progress_bar
 from d2_plugin.runs.scene import Scene
+from d2_plugin.store.store import PriorStore
 
 
 def build_priors_for(
@@ -43,11 +45,16 @@ def build_priors_for(
             from d2_plugin.priors.dask_build import build_priors_on_cluster  # needs an extra
 
             build = partial(build_priors_on_cluster, **cluster)
-        return build(
+        summary = build(
             *(scene.recording, scene.train_cameras, folder, scene.prior_settings),
             sparse_points=points,
             progress=report,
         )
+    if scene.prior_settings.between and scene.plan.uses("temporal") and shard is None:
+        store = PriorStore.described(PriorStore.located(folder, scene.train_cameras))
+        with progress_bar("between", len(store.cameras) * (len(store.frames) - 1)) as bar:
+            build_between(store, bar.update)
+    return summary
 
 
 def refuse_unusable(summary: PriorSummary, accepted: bool) -> None:

@@ -1,0 +1,228 @@
+"""Where what moves goes from one instant of a camera to its next: dense flow, and fast regions matched as wholes.
+
+Dense flow (OpenCV's DIS) follows what moves by a few pixels. A small thing that moves by more than its own size, a
+thrown ball, it does not find: such a region differs from the still background and is not explained by the flow at
+either instant, and it is matched as a whole. Between two instants it goes straight on, unless the regions of all
+cameras and instants, placed in the world by D*, agree on one acceleration: then it falls.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from d2_plugin.priors.extras import opencv
+
+FOREGROUND = 20
+"""A channel, of 0 to 255, that differs by more than this from the still image shows something else."""
+STILL_INSTANTS = 9
+"""Of how many instants, evenly spread, the still image is the median."""
+RETURNS = 1.5
+"""Flow is believed where forward and backward flow cancel within so many pixels, and ..."""
+RESEMBLES = 30
+"""... where the blurred images differ by less than this there."""
+SMALLEST = 8
+"""Pixels of a region that is matched."""
+UNFOLLOWED = 0.4
+"""A foreground component of which flow does not follow this share is matched whole, of others the part it loses."""
+REACH = 5
+"""A region is searched within the image's width over this."""
+LANDS_BESIDE = 40.0
+"""What is added to a match's root mean square difference if none of it lands on foreground."""
+WORST_MATCH = 32.0
+"""Largest such cost of a match."""
+FAST = 0.7
+"""A region is fast that goes further than this many of its radii."""
+AGREE = 0.35
+"""Two accelerations agree that differ by less than this share of either."""
+FEWEST_AGREEING = 8
+"""Accelerations that must agree before anything falls, and at least three of ten."""
+
+
+def still_image(images: Sequence[np.ndarray]) -> np.ndarray:
+    """What a camera sees where nothing moves, [H, W, 3] float32: the median of some of its images over time."""
+    chosen = np.unique(np.linspace(0, len(images) - 1, STILL_INSTANTS).round().astype(int))
+    return np.median([images[index] for index in chosen], axis=0).astype(np.float32)
+
+
+def foreground(image: np.ndarray, still: np.ndarray) -> np.ndarray:
+    """Pixels [H, W] that differ from the still image, without specks."""
+    cv2 = opencv("scene flow")
+    differs = (np.abs(image - still).max(-1) > FOREGROUND).astype(np.uint8)
+    closed = cv2.morphologyEx(differs, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
+    opened: np.ndarray = cv2.morphologyEx(closed, cv2.MORPH_OPEN, np.ones((2, 2), np.uint8)) > 0
+    return opened
+
+
+def dense_flow(image: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Optical flow [H, W, 2] (columns, rows) in pixels from one RGB image to another, to the finest scale."""
+    cv2 = opencv("scene flow")
+    method = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    method.setFinestScale(0)
+    flow: np.ndarray = method.calc(*(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY) for picture in (image, other)), None)
+    return flow
+
+
+def followed(image: np.ndarray, other: np.ndarray, flow: np.ndarray, back: np.ndarray) -> np.ndarray:
+    """Pixels [H, W] of `image` that the flow follows: `back` returns, and the colours are alike."""
+    cv2 = opencv("scene flow")
+    height, width = flow.shape[:2]
+    rows, columns = np.mgrid[:height, :width].astype(np.float32)
+    target = columns + flow[..., 0], rows + flow[..., 1]
+
+    def there(values: np.ndarray) -> np.ndarray:
+        warped: np.ndarray = cv2.remap(values, *target, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return warped
+
+    returns = np.linalg.norm(flow + there(back), axis=-1) < RETURNS
+    differs = np.abs(image.astype(np.float32) - there(other).astype(np.float32)).max(-1)
+    return returns & (cv2.GaussianBlur(differs, (0, 0), 1) < RESEMBLES)
+
+
+@dataclass(frozen=True, eq=False)
+class Region:
+    """What flow does not follow, matched as a whole between two instants of a camera."""
+
+    start: np.ndarray  # int [n], its pixels at the earlier instant, as flat indices
+    end: np.ndarray  # int [m], at the later one
+    shift: np.ndarray  # [2] pixels (columns, rows)
+    cost: float
+    shape: tuple[int, ...]
+
+    @property
+    def fast(self) -> bool:
+        """Whether it goes further than its own size."""
+        return float(np.hypot(*self.shift)) > FAST * np.sqrt(len(self.start) / np.pi)
+
+
+def regions(
+    earlier: np.ndarray, later: np.ndarray, still: np.ndarray, flow: np.ndarray, back: np.ndarray
+) -> list[Region]:
+    """The regions that are found at both instants, matched from either and confirmed from the other, best match last.
+
+    Args:
+        earlier, later: RGB images [H, W, 3] uint8.
+        still: of the camera, see `still_image`.
+        flow, back: dense flow from the earlier image to the later one, and back.
+    """
+    fronts = foreground(earlier, still), foreground(later, still)
+    lost = fronts[0] & ~followed(earlier, later, flow, back), fronts[1] & ~followed(later, earlier, back, flow)
+    matched: list[Region] = []
+    for images, masks, unexplained, forwards in (
+        ((earlier, later), fronts, lost[0], True),
+        ((later, earlier), fronts[::-1], lost[1], False),
+    ):
+        for mask in _pieces(masks[0], unexplained):
+            shift, cost = _match(*images, mask, masks[1])
+            landed = _moved(mask, shift) & masks[1]
+            if cost > WORST_MATCH or np.hypot(*shift) < 3 or landed.sum() <= SMALLEST:
+                continue
+            back_again, _ = _match(*images[::-1], landed, masks[0])
+            if np.abs(shift + back_again).sum() <= 3:
+                here, there = np.flatnonzero(mask), np.flatnonzero(landed)
+                start, end, way = (here, there, shift) if forwards else (there, here, -shift)
+                matched.append(Region(start, end, way, cost, still.shape[:2]))
+    return sorted(matched, key=lambda region: -region.cost)
+
+
+def _pieces(front: np.ndarray, unexplained: np.ndarray) -> Iterator[np.ndarray]:
+    """The masks of what is to be matched: whole foreground components, or the unexplained parts of them."""
+    cv2 = opencv("scene flow")
+    unexplained = cv2.morphologyEx(unexplained.astype(np.uint8), cv2.MORPH_OPEN, np.ones((2, 2), np.uint8)) > 0
+    for component in _components(front, SMALLEST):
+        share = (unexplained & component).sum() / component.sum()
+        if share > UNFOLLOWED:
+            yield component
+        elif share > 0:
+            for part in _components(unexplained & component, 20):
+                yield (cv2.dilate(part.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0) & component
+
+
+def _components(mask: np.ndarray, least: int) -> Iterator[np.ndarray]:
+    count, labels, statistics, _ = opencv("scene flow").connectedComponentsWithStats(mask.astype(np.uint8))
+    return (labels == index for index in range(1, count) if statistics[index, 4] >= least)
+
+
+def _match(image: np.ndarray, other: np.ndarray, mask: np.ndarray, front: np.ndarray) -> tuple[np.ndarray, float]:
+    """The shift [2] at which the pixels of a mask look alike in the other image and land on its foreground; its cost.
+
+    The nearer of two equal matches is taken.
+    """
+    cv2 = opencv("scene flow")
+    rows, columns = np.nonzero(mask)
+    box = slice(rows.min(), rows.max() + 1), slice(columns.min(), columns.max() + 1)
+    reach = mask.shape[1] // REACH
+    window = slice(box[0].start, box[0].stop + 2 * reach), slice(box[1].start, box[1].stop + 2 * reach)
+    padded = [
+        cv2.copyMakeBorder(map_.astype(np.float32), reach, reach, reach, reach, cv2.BORDER_CONSTANT)[window]
+        for map_ in (other, front)
+    ]
+    weight = mask[box].astype(np.float32)
+    channels = np.repeat(weight[..., None], 3, 2)
+    squares = cv2.matchTemplate(padded[0], image[box].astype(np.float32), cv2.TM_SQDIFF, mask=channels)
+    beside = 1 - cv2.matchTemplate(padded[1], weight, cv2.TM_CCORR) / weight.sum()
+    cost = np.sqrt(np.maximum(squares, 0) / (3 * weight.sum())) + LANDS_BESIDE * beside
+    distance = np.hypot(*np.mgrid[-reach : reach + 1, -reach : reach + 1])
+    row, column = np.unravel_index(np.argmin(cost + 0.05 * distance), cost.shape)
+    return np.array([column - reach, row - reach], float), float(cost[row, column])
+
+
+def _moved(mask: np.ndarray, shift: np.ndarray) -> np.ndarray:
+    """The mask shifted by whole pixels."""
+    cv2 = opencv("scene flow")
+    moving = np.array([[1, 0, shift[0]], [0, 1, shift[1]]], np.float32)
+    moved: np.ndarray = cv2.warpAffine(mask.astype(np.uint8), moving, mask.shape[::-1], flags=cv2.INTER_NEAREST) > 0
+    return moved
+
+
+@dataclass(frozen=True, eq=False)
+class Flight:
+    """A fast region with its displacements [3] in the world: over this interval, and over those beside it if known."""
+
+    start: np.ndarray  # [3] world
+    over: np.ndarray
+    before: np.ndarray | None
+    after: np.ndarray | None
+
+    def accelerations(self) -> list[np.ndarray]:
+        """Changes of displacement from interval to interval, [3] each."""
+        changes = [] if self.before is None else [self.over - self.before]
+        return changes if self.after is None else [*changes, self.after - self.over]
+
+    def bend(self, acceleration: np.ndarray) -> np.ndarray:
+        """How far from the middle of the straight line it is halfway, [3].
+
+        Where what came before and what comes after both contradict the acceleration, it hit something in between: both
+        flights are continued into the interval, and the one that has fallen less far is where it is.
+        """
+        own = self.accelerations()
+        gaps = [float(np.linalg.norm(one - acceleration)) for one in own]
+        if not own or min(gaps) <= 0.5 * float(np.linalg.norm(acceleration)):
+            return -acceleration / 8
+        if self.before is None or self.after is None:
+            return -own[0] / 8
+        onwards = 0.5 * (self.before + acceleration) - acceleration / 8
+        backwards = self.over - (0.5 * (self.after - acceleration) + acceleration / 8)
+        halfway = onwards if onwards @ acceleration < backwards @ acceleration else backwards
+        return halfway - self.over / 2
+
+
+def common_acceleration(flights: Sequence[Flight]) -> np.ndarray | None:
+    """The acceleration [3], world units per interval squared, that most flights share; None where they do not."""
+    seen = np.array([change for flight in flights for change in flight.accelerations()]).reshape(-1, 3)
+    if len(seen) < FEWEST_AGREEING:
+        return None
+    lengths = np.linalg.norm(seen, axis=1)
+    agree = np.linalg.norm(seen[:, None] - seen[None], axis=-1) < AGREE * lengths[:, None]
+    most = int(np.argmax(agree.sum(1)))
+    if agree[most].sum() < max(FEWEST_AGREEING, 0.3 * len(seen)):
+        return None
+    shared: np.ndarray = np.median(seen[agree[most]], axis=0)
+    return shared
+
+
+def same_region(a: np.ndarray, b: np.ndarray) -> bool:
+    """Whether two sets of pixels of one image (flat indices) are mostly the same."""
+    return len(np.intersect1d(a, b)) > 0.5 * max(len(a), len(b))

@@ -1,0 +1,239 @@
+"""Scene flow and the instants halfway, in a recording of flat things whose truth halfway is drawn as well."""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from d2_plugin.priors.between import build_between
+from d2_plugin.priors.scene_flow import Flight, common_acceleration, dense_flow, followed, regions
+from d2_plugin.priors.sheet import contact_sheet
+from d2_plugin.protocol import Label
+from d2_plugin.recordings.synthetic.room import synthetic_recording
+from d2_plugin.store.exported import RenamedStore
+from d2_plugin.store.maps import FusedPrior
+from d2_plugin.store.store import QUARTERS, PriorStore
+
+cv2 = pytest.importorskip("cv2")
+
+HEIGHT, WIDTH, FOCAL = 72, 192, 100.0
+RADIUS, BALL_DEPTH, WALL_DEPTH = 6, 2.0, 4.0
+FALL = np.array([0.0, 0.4, 0.0])
+"""World units per interval squared: 20 pixels at the ball's depth."""
+
+
+def wall() -> np.ndarray:
+    """A wall with a texture, RGB [H, W, 3]."""
+    noise = np.random.default_rng(0).integers(60, 140, (HEIGHT // 4, WIDTH // 4, 3)).astype(np.uint8)
+    return cv2.resize(noise, (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC)
+
+
+def ball(column: float, row: float, radius: float = RADIUS) -> np.ndarray:
+    """Its pixels [H, W]."""
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH]
+    return (columns - column) ** 2 + (rows - row) ** 2 < radius**2
+
+
+def shown(*balls: np.ndarray) -> np.ndarray:
+    """The wall with orange balls in front."""
+    image = wall()
+    for mask in balls:
+        image[mask] = (240, 150, 20)
+    return image
+
+
+def way(instant: float) -> tuple[float, float]:
+    """Column and row of a ball thrown at instant 0, in a camera at the origin."""
+    position = np.array([-0.9, 0.5, BALL_DEPTH]) + instant * np.array([0.4, -0.85, 0]) + FALL * instant**2 / 2
+    return tuple(FOCAL * position[:2] / BALL_DEPTH + np.array([WIDTH, HEIGHT]) / 2 - 0.5)
+
+
+def thrown(path: Path, count: int = 5, cameras: int = 3, **changes: np.ndarray) -> PriorStore:
+    """Finished priors of cameras in one place; `changes` are other images by frame, as `frame3=...`."""
+    names = [f"cam{index}" for index in range(cameras)]
+    store = PriorStore.create(path, names, range(count), {"recording": "thrown"})
+    camera = {"K": [[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]], "T_camera_world": np.eye(4).tolist()}
+    for name in names:
+        for frame in range(count):
+            mask = ball(*way(frame))
+            prior = FusedPrior(
+                np.where(mask, BALL_DEPTH, WALL_DEPTH).astype(np.float32),
+                np.full((HEIGHT, WIDTH), Label.VERIFIED, np.uint8),
+                np.full((HEIGHT, WIDTH), 0.01, np.float32),
+                changes.get(f"frame{frame}", shown(mask)),
+            )
+            record = {
+                "key": f"{name} {frame}",
+                "camera": camera,
+                "shares": prior.shares(),
+                "refused": "",
+                "monocular": "",
+            }
+            store.write(name, frame, prior, record)
+    return store
+
+
+class TestRegions:
+    start, end = ball(30, 40), ball(62, 30)
+
+    def matched(self, earlier: np.ndarray, later: np.ndarray) -> list[np.ndarray]:
+        flows = dense_flow(earlier, later), dense_flow(later, earlier)
+        return [region.shift for region in regions(earlier, later, wall().astype(np.float32), *flows)]
+
+    def test_a_ball_that_flow_loses_is_matched_whole_in_both_directions_of_time(self) -> None:
+        images = shown(self.start), shown(self.end)
+        assert not followed(*images, dense_flow(*images), dense_flow(*images[::-1]))[self.start].all()
+        for shift, pair in (((32, -10), images), ((-32, 10), images[::-1])):
+            matched = self.matched(*pair)
+            assert matched
+            assert all(np.abs(one - shift).max() <= 1 for one in matched)
+
+    def test_one_that_is_there_at_one_instant_only_is_not_matched(self) -> None:
+        assert not self.matched(shown(self.start), shown())
+        assert not self.matched(shown(), shown(self.start))
+
+    def test_of_two_each_goes_its_own_way(self) -> None:
+        large = ball(90, 55, 10)
+        matched = self.matched(shown(self.start, large), shown(self.end, ball(60, 57, 10)))
+        assert {tuple(np.round(shift, -1)) for shift in matched} == {(30, -10), (-30, 0)}
+
+    def test_what_is_half_hidden_at_the_end_is_matched_or_left_out(self) -> None:
+        hidden = self.end & (np.mgrid[:HEIGHT, :WIDTH][1] < 62)
+        assert all(np.abs(shift - (32, -10)).max() <= 3 for shift in self.matched(shown(self.start), shown(hidden)))
+
+    def test_nothing_moves_where_nothing_changes(self) -> None:
+        assert not self.matched(shown(self.start), shown(self.start))
+
+
+class TestFlights:
+    def flights(self, count: int = 6) -> list[Flight]:
+        """Of a body that falls, from interval to interval."""
+        places = [np.array([0.1, -0.3, 2.0]) * t + FALL * t**2 / 2 for t in range(-1, count + 3)]
+        steps = np.diff(places, axis=0)
+        return [Flight(places[i], steps[i], steps[i - 1], steps[i + 1]) for i in range(1, count + 1)]
+
+    def test_what_falls_agrees_on_its_acceleration_whatever_else_moves(self) -> None:
+        others = np.random.default_rng(0).normal(size=(8, 3, 3))
+        mixed = [*self.flights(), *(Flight(np.zeros(3), *steps) for steps in others)]
+        np.testing.assert_allclose(common_acceleration(mixed), FALL, atol=0.05)
+
+    def test_what_does_not_agree_does_not_fall(self) -> None:
+        others = np.random.default_rng(0).normal(size=(20, 3, 3))
+        assert common_acceleration([Flight(np.zeros(3), *steps) for steps in others]) is None
+        assert common_acceleration(self.flights(2)) is None
+        assert common_acceleration([]) is None
+
+    def test_halfway_it_is_on_the_parabola(self) -> None:
+        for flight in self.flights():
+            np.testing.assert_allclose(flight.bend(FALL), -FALL / 8, atol=1e-12)
+
+    @pytest.mark.parametrize("impact", [0.25, 0.4, 0.6, 0.75])
+    def test_where_it_hits_something_it_has_turned_by_then_or_not(self, impact: float) -> None:
+        """It falls with 1, and goes up again with 1, `impact` of an interval after the start."""
+
+        def height(t: float) -> float:
+            since, speed = t - impact, 1.0 if t > impact else -1.0
+            return -(speed * since) + FALL[1] * since**2 / 2
+
+        places = [np.array([0.0, height(t), 0.0]) for t in (-1, 0, 1, 2)]
+        flight = Flight(places[1], *(places[i + 1] - places[i] for i in (1, 0, 2)))
+        halfway = places[1] + flight.over / 2 + flight.bend(FALL)
+        np.testing.assert_allclose(halfway[1], height(0.5), atol=1e-9)
+
+
+class TestHalfway:
+    def test_a_thrown_ball_is_on_its_parabola_with_its_depth_and_nothing_is_there_twice(self, tmp_path: Path) -> None:
+        store = thrown(tmp_path)
+        assert build_between(store) == 12
+        for frame, quarter in itertools.product(range(4), QUARTERS):
+            following, halfway = store.underway("cam1", frame, quarter)
+            assert following == frame + 1
+            inner, around = (ball(*way(frame + quarter / 4), RADIUS + by) for by in (-2, 2))
+            image, depth = halfway.colors.numpy().astype(int), halfway.depth.numpy()
+            assert np.abs(image[inner] - (240, 150, 20)).max() < 20
+            assert np.median(np.abs(image - wall())[~around]) == 0
+            twice = (image[..., 0] - image[..., 2] > 120) & ~around & (halfway.labels.numpy() != Label.CONFLICT)
+            assert twice.sum() < 0.1 * around.sum()
+            assert np.isclose(depth[inner], BALL_DEPTH, rtol=1e-3).mean() > 0.9
+            np.testing.assert_array_equal(depth > 0, np.isin(halfway.labels, (Label.VERIFIED,)))
+
+    def test_where_nothing_moves_it_is_the_image_and_no_depth_is_proposed(self, tmp_path: Path) -> None:
+        store = thrown(tmp_path, 3, 1, **{f"frame{frame}": shown() for frame in range(3)})
+        build_between(store)
+        halfway = store.underway("cam0", 0, 2)[1]
+        np.testing.assert_array_equal(halfway.colors, shown())
+        assert (halfway.labels == Label.EMPTY).all()
+        assert not halfway.depth.any()
+
+    def test_motion_is_not_known_where_both_instants_contradict_each_other(self, tmp_path: Path) -> None:
+        sign = wall()
+        sign[20:40, 80:110] = 250
+        store = thrown(tmp_path, 4, 1, frame0=wall(), frame1=sign, frame2=wall(), frame3=wall())
+        build_between(store)
+        labels = store.underway("cam0", 0, 2)[1].labels
+        assert (labels[22:38, 82:108] == Label.CONFLICT).float().mean() > 0.5
+        assert (labels[45:, :70] == Label.EMPTY).all()
+
+    def test_of_light_that_changes_everywhere_nothing_is_known(self, tmp_path: Path) -> None:
+        store = thrown(tmp_path, 4, 1, frame2=shown() + 60)
+        build_between(store)
+        assert (store.underway("cam0", 1, 2)[1].labels == Label.CONFLICT).all()
+        assert (store.underway("cam0", 0, 2)[1].labels != Label.CONFLICT).float().mean() > 0.9
+
+    def test_it_is_made_once_and_anew_where_it_is_damaged_or_a_prior_changed(self, tmp_path: Path) -> None:
+        store = thrown(tmp_path, 3, 1)
+        assert build_between(store) == 2
+        assert build_between(store) == 0
+        path = store.between[2].location("cam0", 1)
+        path.write_bytes(path.read_bytes()[:-1] + b"x")
+        assert build_between(store) == 2
+        store.write("cam0", 2, store_maps(store, "cam0", 2), store.record("cam0", 2) | {"key": "another"})
+        assert build_between(store) == 2
+
+    @pytest.mark.parametrize("count", [1, 2])
+    def test_too_few_instants_have_none_between(self, tmp_path: Path, count: int) -> None:
+        store = thrown(tmp_path, count, 1)
+        assert build_between(store) == 0
+        assert store.underway("cam0", 0, 2) is None
+
+    def test_nor_have_those_of_an_unfinished_build(self, tmp_path: Path) -> None:
+        store = thrown(tmp_path, 4, 1)
+        store.entries.location("cam0", 2).with_suffix(".json").unlink()
+        assert build_between(store) == 0
+
+    def test_an_export_has_it_under_its_own_names(self, tmp_path: Path) -> None:
+        store = thrown(tmp_path, 4, 1)
+        build_between(store)
+        renamed = RenamedStore(store, {"a": "cam0"}, {10: 1, 11: 2})
+        following, halfway = renamed.underway("a", 10, 2)
+        assert following == 11
+        assert torch.equal(halfway.colors, store.underway("cam0", 1, 2)[1].colors)
+        assert renamed.underway("a", 11, 2) is None  # frame 3 was not exported
+
+    def test_the_contact_sheet_shows_it_below_the_priors(self, tmp_path: Path) -> None:
+        store, recording = thrown(tmp_path, 3, 1), synthetic_recording(cameras=1, held_out=0, frames=1)
+        alone = cv2.imread(str(contact_sheet(store, _Of(recording), tmp_path / "a.png", [0], width=64)))
+        build_between(store)
+        both = cv2.imread(str(contact_sheet(store, _Of(recording), tmp_path / "b.png", [0], width=64)))
+        np.testing.assert_array_equal(both[: len(alone)], alone)
+        assert len(both) == len(alone) + 18 + 64 * HEIGHT // WIDTH
+
+
+class _Of:
+    """A recording as far as the sheet reads it."""
+
+    def __init__(self, recording: object) -> None:
+        self.frames = (0, 1, 2)
+
+    def image(self, camera: str, frame: int) -> np.ndarray:
+        return shown(ball(*way(frame)))
+
+
+def store_maps(store: PriorStore, camera: str, frame: int) -> FusedPrior:
+    """A prior as it was written."""
+    prior = store.prior(camera, frame)
+    return FusedPrior(*(map_.numpy() for map_ in (prior.depth, prior.labels, prior.sigma, prior.colors)))
