@@ -87,7 +87,7 @@ class StepScene:
         """A trainer of the native backbone whose Gaussians stay as they are: no density control, steps of no length."""
         backbone: Any = registry.load(registry.BACKBONES, "yang4d")
         duration = max(view.time for view in self.frames.views)
-        settings = backbone.settings_from({"densify": {"enabled": False}, "position_rate": 1e-30})
+        settings = backbone.settings_from({"densify": {"enabled": False}, "position_rate": 1e-9})
         model = backbone.Yang4D(self._rows(backbone, settings, duration), settings, 5.0, duration)
         # Images and depth are random: what they would teach is another model for each work, and after some hundred
         # steps those with D2 took nearly a fifth longer to draw.

@@ -187,7 +187,7 @@ def _caller() -> str:
 @pytest.fixture
 def fake_gpu(monkeypatch: pytest.MonkeyPatch) -> Iterator[FakeGpu]:
     """The GPU, with the kernels of gpu.cu on it."""
-    from cuda_cases import ShimLauncher, shim_library
+    from splat_scenes import ShimLauncher, shim_library
 
     from d2_plugin.compiler import NoCompiler
 

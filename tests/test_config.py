@@ -40,7 +40,11 @@ def run(table: dict[str, Any]) -> RunSettings:
         (D2Config.from_dict, {"view_per_evaluation": 3}, r"unknown setting 'view_per.*did you mean 'views_per_eval"),
         (D2Config.from_dict, {"version": 2}, r"the configuration has settings of version 2, and this d2-4dgs reads"),
         (deform.settings_from, {"raster": {"near": -1}}, r"backbone\.raster\.near must be above 0 world units, got -1"),
-        (deform.settings_from, {"hexplane": {"resolutions": [8, 0]}}, r"resolutions\[1\] must be at least 1 and at most 1024, got 0"),
+        (
+            deform.settings_from,
+            {"hexplane": {"resolutions": [8, 0]}},
+            r"resolutions\[1\] must be at least 1 and at most 1024, got 0",
+        ),
         (deform.settings_from, {"hexplane": {"resolutions": []}}, r"resolutions has no level: give at least one"),
         (deform.settings_from, {"field": "hexplan"}, r"unknown backbone\.field 'hexplan': have hexplane, mlp; did you"),
         (
@@ -50,7 +54,11 @@ def run(table: dict[str, Any]) -> RunSettings:
         ),
         (PriorSettings.from_dict, {"depth_range": [1, 2, 3]}, "depth_range must be a list of 2 values, got .1, 2, 3."),
         (PriorSettings.from_dict, {"depth_range": [9.0, 1.0]}, "0 < near < far"),
-        (PriorSettings.from_dict, {"depth_range": [1.0, math.inf]}, r"depth_range\[1\] must be above 0 and at most 1e.09, got inf"),
+        (
+            PriorSettings.from_dict,
+            {"depth_range": [1.0, math.inf]},
+            r"depth_range\[1\] must be above 0 and at most 1e.09, got inf",
+        ),
         (PriorSettings.from_dict, {"variant": "duel"}, "unknown priors.variant 'duel': .* did you mean 'dual'"),
         (PriorSettings.from_dict, {"stereo": {"matchers": "x"}}, "unknown setting of priors.stereo 'matchers'"),
         (PriorSettings.from_dict, {"stereo": {"min_angle": 60.0}}, "min_angle must be below max_angle, got 60 and 60"),

@@ -115,7 +115,7 @@ class Form:
             setting = flags.get(flag.replace("_", "-"))
             if setting is None:
                 raise D2Error(f"unknown flag {flag} of {self.command}{self._hint(flag, words)}")
-            if _is_switch(setting) and not attached:
+            if is_switch(setting) and not attached:
                 text = "true"
             elif not attached:
                 text = next(left, "--none")
@@ -183,9 +183,9 @@ def _sections(name: str, kind: type, without: tuple[str, ...] = ()) -> Iterator[
             yield from _sections(f"{name}.{place}", option)
 
 
-def _is_switch(setting: Declared) -> bool:
-    """Whether a flag stands alone: in a table, where a switch may be on by default, it takes true or false."""
-    return bare(setting.kind) is bool and "." not in setting.name
+def is_switch(setting: Declared) -> bool:
+    """Whether a flag stands alone; what is on by default, and what stands in a table, takes true or false."""
+    return bare(setting.kind) is bool and "." not in setting.name and setting.default is not True
 
 
 def _is_flag(word: str) -> bool:

@@ -8,8 +8,8 @@ import textwrap
 from collections.abc import Sequence
 from dataclasses import MISSING
 
-from d2_plugin.commands.arguments.form import HELP, Form, Section, typed_as
-from d2_plugin.commands.arguments.text import bare, flag_of, item_kind, limits, placeholder, written
+from d2_plugin.commands.arguments.form import HELP, Form, Section, is_switch, typed_as
+from d2_plugin.commands.arguments.text import flag_of, item_kind, limits, placeholder, written
 from d2_plugin.errors import unknown_name
 from d2_plugin.settings import Declared, Range
 
@@ -68,7 +68,7 @@ def _typed(setting: Declared) -> str:
     """A setting of a command as it is typed."""
     if setting.positional:
         return typed_as(setting) + (" ..." if item_kind(setting.kind) is not None else "")
-    return typed_as(setting) if bare(setting.kind) is bool else f"{typed_as(setting)} {placeholder(setting.kind)}"
+    return typed_as(setting) if is_switch(setting) else f"{typed_as(setting)} {placeholder(setting.kind)}"
 
 
 def _explained(setting: Declared) -> str:

@@ -137,7 +137,7 @@ def _known_rig(
             )
     wrong, said = _contradiction(turned, cameras) if len(cameras) > 1 else (False, "")
     if wrong and not settings.accept_calibration:
-        raise D2Error(f"{calibration} does not fit the videos: {said}; or give --accept-calibration true")
+        raise D2Error(f"{calibration} does not fit the videos: {said}; or give --accept-calibration")
     more = (*more, said) if said else more
     return turned, {camera.name: camera for camera in cameras}, (*notes, *more)
 
@@ -220,7 +220,7 @@ def _notes_of_videos(
             if not settings.accept_calibration:
                 raise D2Error(
                     f"{said}: import the parts by themselves (--times), each with its calibration, or give "
-                    "--accept-calibration true"
+                    "--accept-calibration"
                 )
             notes.append(said)
         if steady.drift > DRIFT:

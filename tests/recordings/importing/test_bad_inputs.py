@@ -234,8 +234,8 @@ def test_who_knows_better_imports_all_the_same(given: Filmed, tmp_path: Path, ca
     words = ["import", str(given.videos), "--calibration", str(given.calibration), "--output", str(tmp_path / "c")]
     words += ["--exposure", "false", "--offsets", "none", "--frames", "0:1", "--images", "videos"]
     assert main(words) == 2
-    assert "or give --accept-calibration true" in capsys.readouterr().err
-    assert main([*words, "--accept-calibration", "true"]) == 0
+    assert "or give --accept-calibration" in capsys.readouterr().err
+    assert main([*words, "--accept-calibration"]) == 0
     assert any("misses features" in note for note in open_recording(tmp_path / "c").notes)
 
 
