@@ -25,19 +25,7 @@ from d2_plugin.recordings.images import MOST_PIXELS
 from d2_plugin.recordings.recording import Source
 
 VIDEO_SUFFIXES = (
-    ".mp4",
-    ".mov",
-    ".m4v",
-    ".mkv",
-    ".avi",
-    ".webm",
-    ".mts",
-    ".m2ts",
-    ".mpg",
-    ".mpeg",
-    ".360",
-    ".lrv",
-    ".ts",
+    *(".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm", ".mts", ".m2ts", ".mpg", ".mpeg", ".360", ".lrv", ".ts"),
 )
 """Endings by which a folder's videos are listed."""
 

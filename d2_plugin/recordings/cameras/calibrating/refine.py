@@ -127,7 +127,7 @@ def turns_in_words(turns: Mapping[str, Turn], cameras: Collection[str]) -> list[
     """A sentence for each camera that is turned, then what is known of the others."""
     sentences = [
         f"camera {name} is turned by {turn.degrees:.2f} degrees (known within {turn.doubt:.2f}) and misses what others "
-        f"see by {turn.pixels:.1f} pixels: give --refine-poses true, or calibrate it again"
+        f"see by {turn.pixels:.1f} pixels: give --refine-poses, or calibrate it again"
         for name, turn in turns.items()
         if turn.wrong
     ]
