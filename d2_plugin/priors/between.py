@@ -31,7 +31,7 @@ from d2_plugin.store.files import hash_of
 from d2_plugin.store.maps import FusedPrior, empty_prior
 from d2_plugin.store.store import QUARTERS, PriorStore
 
-VERSION = 2
+VERSION = 3
 """Of what is made from the same priors; raise it when that changes."""
 
 MOVES = 0.6

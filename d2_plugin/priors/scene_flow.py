@@ -8,6 +8,7 @@ cameras and instants, placed in the world by D*, agree on one acceleration: then
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -15,6 +16,8 @@ import numpy as np
 
 from d2_plugin.priors.extras import opencv
 
+FINE_WIDTH = 320
+"""Flow is followed, and regions are searched, in images about as wide; a wider one gives the last pixels alone."""
 FOREGROUND = 20
 """A channel, of 0 to 255, that differs by more than this from the still image shows something else."""
 STILL_INSTANTS = 9
@@ -57,10 +60,10 @@ def foreground(image: np.ndarray, still: np.ndarray) -> np.ndarray:
 
 
 def dense_flow(image: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Optical flow [H, W, 2] (columns, rows) in pixels from one RGB image to another, to the finest scale."""
+    """Optical flow [H, W, 2] (columns, rows) in pixels from one RGB image to another."""
     cv2 = opencv("scene flow")
     method = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    method.setFinestScale(0)
+    method.setFinestScale(round(math.log2(max(image.shape[1] / FINE_WIDTH, 1))))
     flow: np.ndarray = method.calc(*(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY) for picture in (image, other)), None)
     return flow
 
@@ -150,13 +153,33 @@ def _match(image: np.ndarray, other: np.ndarray, mask: np.ndarray, front: np.nda
 
     The nearer of two equal matches is taken.
     """
+    factor, reach = max(1, round(mask.shape[1] / FINE_WIDTH)), mask.shape[1] // REACH
+    near = np.zeros(2, int)
+    if factor > 1:
+        size = mask.shape[1] // factor, mask.shape[0] // factor
+        small = [
+            opencv("scene flow").resize(map_.astype(np.float32), size, interpolation=3)  # by area
+            for map_ in (image, other, mask, front)
+        ]
+        if (small[2] > 0.5).any():
+            shift, _ = _search(small[0], small[1], small[2] > 0.5, small[3] > 0.5, near, reach // factor)
+            near, reach = factor * shift.astype(int), factor
+    return _search(image, other, mask, front, near, reach)
+
+
+def _search(
+    image: np.ndarray, other: np.ndarray, mask: np.ndarray, front: np.ndarray, near: np.ndarray, reach: int
+) -> tuple[np.ndarray, float]:
+    """The best shift [2] of those that differ from `near` by `reach` at most, and its cost."""
     cv2 = opencv("scene flow")
     rows, columns = np.nonzero(mask)
     box = slice(rows.min(), rows.max() + 1), slice(columns.min(), columns.max() + 1)
-    reach = mask.shape[1] // REACH
-    window = slice(box[0].start, box[0].stop + 2 * reach), slice(box[1].start, box[1].stop + 2 * reach)
+    rim = reach + int(np.abs(near).max())
+    window = tuple(
+        slice(side.start + rim + shift - reach, side.stop + rim + shift + reach) for side, shift in zip(box, near[::-1])
+    )
     padded = [
-        cv2.copyMakeBorder(map_.astype(np.float32), reach, reach, reach, reach, cv2.BORDER_CONSTANT)[window]
+        cv2.copyMakeBorder(map_.astype(np.float32), rim, rim, rim, rim, cv2.BORDER_CONSTANT)[window]
         for map_ in (other, front)
     ]
     weight = mask[box].astype(np.float32)
@@ -164,9 +187,9 @@ def _match(image: np.ndarray, other: np.ndarray, mask: np.ndarray, front: np.nda
     squares = cv2.matchTemplate(padded[0], image[box].astype(np.float32), cv2.TM_SQDIFF, mask=channels)
     beside = 1 - cv2.matchTemplate(padded[1], weight, cv2.TM_CCORR) / weight.sum()
     cost = np.sqrt(np.maximum(squares, 0) / (3 * weight.sum())) + LANDS_BESIDE * beside
-    distance = np.hypot(*np.mgrid[-reach : reach + 1, -reach : reach + 1])
-    row, column = np.unravel_index(np.argmin(cost + 0.05 * distance), cost.shape)
-    return np.array([column - reach, row - reach], float), float(cost[row, column])
+    down, across = np.mgrid[-reach : reach + 1, -reach : reach + 1] + near[::-1, None, None]
+    row, column = np.unravel_index(np.argmin(cost + 0.05 * np.hypot(down, across)), cost.shape)
+    return np.array([across[row, column], down[row, column]], float), float(cost[row, column])
 
 
 def _moved(mask: np.ndarray, shift: np.ndarray) -> np.ndarray:

@@ -110,7 +110,8 @@ class Run:
         with self._writing(), self._timed("priors"):
             points = self._points()
             if priors and self.uses_prior:
-                self._take(build_priors_for(self.scene, points.positions, self._store), on_prior)
+                between = "motion" in self.settings.hooks
+                self._take(build_priors_for(self.scene, points.positions, self._store, between=between), on_prior)
         return points
 
     def _take(self, summary: PriorSummary, on_prior: Callable[[PriorSummary], None] | None) -> None:

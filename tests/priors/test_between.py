@@ -79,18 +79,26 @@ def thrown(path: Path, count: int = 5, cameras: int = 3, **changes: np.ndarray) 
 
 class TestRegions:
     start, end = ball(30, 40), ball(62, 30)
+    images = shown(start), shown(end)
 
     def matched(self, earlier: np.ndarray, later: np.ndarray) -> list[np.ndarray]:
         flows = dense_flow(earlier, later), dense_flow(later, earlier)
         return [region.shift for region in regions(earlier, later, wall().astype(np.float32), *flows)]
 
     def test_a_ball_that_flow_loses_is_matched_whole_in_both_directions_of_time(self) -> None:
-        images = shown(self.start), shown(self.end)
+        images = self.images
         assert not followed(*images, dense_flow(*images), dense_flow(*images[::-1]))[self.start].all()
         for shift, pair in (((32, -10), images), ((-32, 10), images[::-1])):
             matched = self.matched(*pair)
             assert matched
             assert all(np.abs(one - shift).max() <= 1 for one in matched)
+
+    def test_an_image_four_times_as_wide_is_searched_in_a_small_one_and_gives_its_own_pixels(self) -> None:
+        earlier, later, still = (np.kron(image, np.ones((4, 4, 1), np.uint8)) for image in (*self.images, wall()))
+        flows = dense_flow(earlier, later), dense_flow(later, earlier)
+        matched = regions(earlier, later, still.astype(np.float32), *flows)
+        assert matched
+        assert all(np.abs(region.shift - (128, -40)).max() <= 1 for region in matched)
 
     def test_one_that_is_there_at_one_instant_only_is_not_matched(self) -> None:
         assert not self.matched(shown(self.start), shown())

@@ -132,7 +132,8 @@ def _build(sender: Connection, settings: RunSettings, points: np.ndarray, folder
     end_with_parent()
     be_silent()
     try:
-        summary = build_priors_for(Scene.open(settings), points, folder, on_image=sender.send)
+        between = "motion" in settings.hooks
+        summary = build_priors_for(Scene.open(settings), points, folder, on_image=sender.send, between=between)
     except D2Error as refusal:
         sender.send(str(refusal))
     else:

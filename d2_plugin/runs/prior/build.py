@@ -25,12 +25,14 @@ def build_priors_for(
     shard: tuple[int, int] | None = None,
     cluster: Mapping[str, Any] | None = None,
     on_image: Callable[[int], None] | None = None,
+    between: bool = True,
 ) -> PriorSummary:
     """Build what is missing of the depth prior in `folder`; `points` [P, 3] bound the depths that are searched.
 
     `shard` (index from 0, count) builds one part, so that any scheduler can run the parts beside each other. `cluster`
     (`scheduler` or `workers`) hands the frames to dask.distributed instead. `on_image` is called with the number of
-    images that are done: all cameras of one frame after the other, the frames in order.
+    images that are done: all cameras of one frame after the other, the frames in order. `between` makes the instants
+    between the frames as well, for the hook `motion`.
     """
     with progress_bar("priors", len(scene.recording.frames) * len(scene.train_cameras)) as bar:
 
@@ -50,7 +52,7 @@ def build_priors_for(
             sparse_points=points,
             progress=report,
         )
-    if scene.prior_settings.between and scene.plan.uses("temporal") and shard is None:
+    if between and scene.prior_settings.between and scene.plan.uses("temporal") and shard is None:
         store = PriorStore.described(PriorStore.located(folder, scene.train_cameras))
         with progress_bar("between", len(store.cameras) * (len(store.frames) - 1)) as bar:
             build_between(store, bar.update)
