@@ -130,7 +130,7 @@ def first_of_each(keys: Tensor) -> Tensor:
     return torch.zeros_like(first).scatter(0, order, first)
 
 
-class Motion:
+class MovingPixels:
     """Compares the images of a camera that stands still with their median over time, from the prior's colours.
 
     A Gaussian that is inserted where the image moves must not outlive its instant.
@@ -181,7 +181,7 @@ class Densify(Hook):
 
     def __init__(self, config: DensifyConfig) -> None:
         super().__init__(config)
-        self._motion = Motion()
+        self._moving = MovingPixels()
 
     def edit(self, context: Context) -> Edit | None:
         """Points from the under-reconstructed pixels of the evaluated views, within the budget."""
@@ -230,7 +230,7 @@ class Densify(Hook):
 
     def _lifetimes(self, view: View, context: Context) -> Tensor | None:
         """How long a new Gaussian may live at each pixel [H, W], infinite where nothing moves; None: not known."""
-        intervals = None if self.config.lifetime is None else self._motion.intervals(view, context)
+        intervals = None if self.config.lifetime is None else self._moving.intervals(view, context)
         return None if self.config.lifetime is None or intervals is None else self.config.lifetime * intervals
 
     def _interval_everywhere(self, view: View, context: Context) -> Tensor | None:

@@ -1,4 +1,4 @@
-"""What moves in the image lives as long as its instant; what stands still lives as the backbone lets it."""
+"""The hook `motion`: the image halfway between two instants supervises whatever moves the Gaussians."""
 
 from __future__ import annotations
 
@@ -6,158 +6,157 @@ from dataclasses import replace
 
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
-from tiny import DISTANCE, HEIGHT, WIDTH, make_adapter, make_model, make_views
+from tiny import ALL_HOOKS, HEIGHT, WIDTH, TinyFrames, TinyStore, make_adapter, make_model, make_views, parameters, same
 from torch import Tensor
 
-from d2_plugin.config import DensifyConfig
-from d2_plugin.hooks.densify import CHANGED, Densify, Motion
+from d2_plugin.backbones.trainer import Trainer, TrainSettings
+from d2_plugin.config import D2Config, DensifyConfig, MotionConfig
 from d2_plugin.hooks.hook import Context
+from d2_plugin.hooks.motion import Motion
 from d2_plugin.hooks.prior import PriorLoader
-from d2_plugin.protocol import DepthPrior, Label, Points, View
+from d2_plugin.plugin import D2Hooks
+from d2_plugin.protocol import DepthPrior, Label, View
 
-INTERVAL = 0.1
-BAR = 2
-"""Width of what moves, pixels."""
-
-
-def instants(count: int, camera: str = "cam0") -> list[View]:
-    """Views of a camera that stands still."""
-    view = make_views()[0]
-    return [replace(view, camera=camera, frame=frame, time=frame * INTERVAL) for frame in range(count)]
+VIEWS = make_views()
+FIRST, SECOND = VIEWS[0], VIEWS[3]
+"""One camera at two instants, half a second apart."""
 
 
-class Crossing:
-    """A grey plane, known everywhere, and a white bar that goes on by its own width from instant to instant."""
+class Halfway(TinyStore):
+    """The prior of the tiny scene with a view halfway; its left quarter moves, its right quarter is not known."""
 
-    def __init__(self, flicker: float = 0, colors: bool = True) -> None:
-        self.flicker, self.colors = flicker, colors
+    def __init__(self, image: Tensor | None = None, unknown: int = WIDTH // 4) -> None:
+        self.image = torch.full((HEIGHT, WIDTH, 3), 90, dtype=torch.uint8) if image is None else image
+        self.unknown = unknown
 
-    def prior(self, camera: str, frame: int) -> DepthPrior:
-        """D* of any view."""
-        labels = torch.full((HEIGHT, WIDTH), int(Label.VERIFIED), dtype=torch.uint8)
-        return DepthPrior(torch.full((HEIGHT, WIDTH), DISTANCE), labels, self.image(frame) if self.colors else None)
-
-    def image(self, frame: int) -> Tensor:
-        """uint8 [H, W, 3]."""
-        grey = 100 + (self.flicker if frame % 2 else 0)
-        image = torch.full((HEIGHT, WIDTH, 3), grey)
-        image[:, BAR * frame : BAR * (frame + 1)] = 255
-        return image.to(torch.uint8)
+    def underway(self, camera: str, frame: int, quarter: int) -> tuple[int, DepthPrior] | None:
+        """From the first instant to the second, as if nothing moved from quarter to quarter."""
+        if frame > 0:
+            return None
+        labels = torch.zeros(HEIGHT, WIDTH, dtype=torch.uint8)
+        labels[:, : WIDTH // 4], labels[:, WIDTH - self.unknown :] = Label.VERIFIED, Label.CONFLICT
+        depth = torch.where(labels == Label.VERIFIED, 2.5, 0.0)
+        return 1, DepthPrior(depth, labels, self.image, torch.where(labels == Label.VERIFIED, 0.01, torch.inf))
 
 
-def context_of(store: Crossing, known: list[View], count: int = 1) -> Context:
-    """What the hooks see at an evaluation once `known` was trained on."""
-
+def context_of(adapter: object, store: object, views: list[View], known: list[View], step: int = 2) -> Context:
     def of(camera: str) -> list[View]:
         return [view for view in known if view.camera == camera]
 
-    model = make_model(count=count)
+    return Context(step, adapter, views, PriorLoader(store), torch.Generator(), tuple, of)
+
+
+def loss_of(adapter: object, store: object | None = None, step: int = 2, **changes: float) -> Tensor | None:
+    context = context_of(adapter, store or Halfway(), [FIRST], [FIRST, SECOND], step)
+    return Motion(MotionConfig(**changes)).loss(context)
+
+
+def shown(adapter: object, time: float) -> Tensor:
+    """What the backbone renders of the first camera, with its background."""
+    return adapter.model.render(replace(FIRST, time=time)).color.detach()
+
+
+@pytest.mark.parametrize("backbone", ["yang4d", "mlp"])
+class TestLoss:
+    def test_of_the_render_itself_at_that_time_it_is_next_to_nothing(self, backbone: str) -> None:
+        adapter = make_adapter(make_model(backbone=backbone))
+        for step, time in ((1, 0.125), (2, 0.25), (3, 0.375), (4, 0.25)):
+            image = (255 * shown(adapter, time)).round().clamp(0, 255).byte()
+            assert float(loss_of(adapter, Halfway(image), step).detach()) < 1e-3
+
+    def test_it_moves_gaussians_and_has_the_weight_that_was_asked_for(self, backbone: str) -> None:
+        adapter = make_adapter(make_model(backbone=backbone))
+        once, twice = loss_of(adapter), loss_of(adapter, weight=2.0)
+        torch.testing.assert_close(twice, 2 * once)
+        once.backward()
+        gradient = adapter.model.gaussians["positions"].grad
+        assert gradient.isfinite().all()
+        assert gradient.any()
+
+    def test_where_motion_is_not_known_the_image_counts_for_nothing(self, backbone: str) -> None:
+        adapter, store = make_adapter(make_model(backbone=backbone)), Halfway()
+        before = float(loss_of(adapter, store).detach())
+        store.image[:, -WIDTH // 4 :] = 255
+        assert float(loss_of(adapter, store).detach()) == before
+        store.image[:, 0] = 255
+        assert float(loss_of(adapter, store).detach()) != before
+
+
+def test_its_gradient_is_that_of_differences_in_time_and_place() -> None:
+    """In float64, through positions, times and what couples them."""
+    model = make_model(count=3, background=False)
     with torch.no_grad():
-        model.gaussians["positions"][:, 2] = 50.0
-    numbers = torch.Generator().manual_seed(0)
-    return Context(1, make_adapter(model), (), PriorLoader(store), numbers, lambda: known[:1], of)
+        for name, value in model.gaussians.parameters.items():
+            value.data = value.data.double()
+            if name in ("left", "right"):
+                value += 0.1 * torch.rand(value.shape, generator=torch.Generator().manual_seed(0), dtype=value.dtype)
+    views = [replace(v, T_camera_world=v.T_camera_world.double(), K=v.K.double()) for v in (FIRST, SECOND)]
+    context = context_of(make_adapter(model), Halfway(unknown=0), views[:1], views)
+    names = ("positions", "times", "left", "right", "opacity_logits")
+    inputs = [model.gaussians.parameters[name] for name in names]
+    # L1 has corners, which differences this small do not meet.
+    assert torch.autograd.gradcheck(lambda *_: Motion(MotionConfig()).loss(context), inputs, eps=1e-7, atol=1e-5)
 
 
-def bar(frame: int) -> Tensor:
-    """Where the bar stands, bool [H, W]."""
-    mask = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
-    mask[:, BAR * frame : BAR * (frame + 1)] = True
-    return mask
+class TestWhereThereIsNothingToLearnFrom:
+    def test_a_store_without_instants_between_adds_nothing(self) -> None:
+        assert loss_of(make_adapter(make_model()), TinyStore()) is None
 
+    def test_nor_does_the_last_instant_or_one_whose_next_has_not_been_seen(self) -> None:
+        adapter = make_adapter(make_model())
+        for views, known in (([SECOND], [FIRST, SECOND]), ([FIRST], [FIRST])):
+            assert Motion(MotionConfig()).loss(context_of(adapter, Halfway(), views, known)) is None
 
-@pytest.mark.parametrize("frame", [0, 3, 6])
-def test_what_moves_has_the_interval_and_the_rest_has_no_end(frame: int) -> None:
-    known = instants(7)
-    found = Motion().intervals(known[frame], context_of(Crossing(), known))
-    torch.testing.assert_close(found, torch.where(bar(frame), INTERVAL, torch.inf))
-
-
-def test_the_interval_is_that_of_the_instants_that_are_trained_on() -> None:
-    known = instants(7)[::2]
-    found = Motion().intervals(known[0], context_of(Crossing(), known))
-    torch.testing.assert_close(found.min(), torch.tensor(2 * INTERVAL))
-
-
-@pytest.mark.parametrize(
-    ("store", "known"),
-    [
-        (Crossing(colors=False), instants(7)),
-        (Crossing(), instants(2)),
-        (Crossing(flicker=2 * CHANGED), instants(7)),
-        (Crossing(), [replace(v, T_camera_world=v.T_camera_world + v.frame) for v in instants(7)]),
-    ],
-    ids=["no colours", "two instants", "light that changes", "a camera that moves"],
-)
-def test_where_nothing_can_be_known_nothing_is_said(store: Crossing, known: list[View]) -> None:
-    assert Motion().intervals(known[1], context_of(store, known)) is None
-
-
-@given(noise=st.integers(0, CHANGED))
-def test_noise_is_no_motion(noise: int) -> None:
-    known = instants(7)
-    found = Motion().intervals(known[5], context_of(Crossing(flicker=noise), known))
-    torch.testing.assert_close(found, torch.where(bar(5), INTERVAL, torch.inf))
-
-
-def test_a_later_run_of_the_same_state_finds_the_same() -> None:
-    """The median is of the first instants seen, which the state of the hooks keeps: a resumed run has it again."""
-    known = instants(7)
-    whole, context = Motion(), context_of(Crossing(), known)
-    whole.intervals(known[0], context_of(Crossing(), known[:4]))
-    torch.testing.assert_close(whole.intervals(known[2], context), Motion().intervals(known[2], context))
+    def test_nor_does_a_backbone_without_colours_which_is_logged_once(self, caplog: pytest.LogCaptureFixture) -> None:
+        adapter = make_adapter(make_model())
+        adapter.colors = None
+        hook, context = Motion(MotionConfig()), context_of(adapter, Halfway(), [FIRST], [FIRST, SECOND])
+        assert [hook.loss(context), hook.loss(context)] == [None, None]
+        assert len([r for r in caplog.records if "colors" in r.message]) == 1
 
 
 class TestInsertion:
-    def inserted(self, **settings: float | None) -> Points:
-        known = instants(7)
-        return Densify(DensifyConfig(spacing=2, **settings)).edit(context_of(Crossing(), known)).insert
-
-    def test_points_of_the_bar_are_brief(self) -> None:
-        points = self.inserted(lifetime=1.5)
-        white = points.colors[:, 0] == 1
-        assert white.any()
-        assert not white.all()
-        torch.testing.assert_close(points.lifetimes[white], torch.full((int(white.sum()),), 1.5 * INTERVAL))
-        assert points.lifetimes[~white].isinf().all()
-
-    def test_off_leaves_time_to_the_backbone(self) -> None:
-        assert self.inserted(lifetime=None).lifetimes is None
-
-    def test_a_backbone_with_extents_in_time_takes_them(self) -> None:
-        model = make_model(count=4)
-        points = self.inserted()
+    def points(self, insert: bool) -> Tensor:
+        """Times and lifetimes of what is inserted where nothing stands."""
+        adapter = make_adapter(make_model(count=1))
         with torch.no_grad():
-            make_adapter(model).insert(points)
-        extents = model.gaussians["log_time_scales"][4:].exp()
-        own = (model.duration / 5) ** 0.5
-        torch.testing.assert_close(extents, points.lifetimes.clamp(max=own).to(extents))
+            adapter.model.gaussians["positions"][:, 2] = 50.0
+        config = D2Config(densify=DensifyConfig(start=2, every=1), motion=MotionConfig(insert=insert), finite_every=0)
+        hooks, inserted = D2Hooks(config, adapter, Halfway()), []
+        adapter.insert = lambda points: inserted.append(points) or 0
+        for view in (FIRST, SECOND):
+            hooks.loss(1, view)
+        hooks.step(2)
+        lifetimes = inserted[0].lifetimes
+        lifetimes = torch.full_like(inserted[0].times, torch.nan) if lifetimes is None else lifetimes
+        return torch.stack([inserted[0].times, lifetimes, inserted[0].positions[:, 2]], 1)
 
-    @pytest.mark.parametrize("backbone", ["yang4d", "mlp"])
-    @pytest.mark.parametrize("temporal", [True, False])
-    def test_a_backbone_without_them_inserts_all_the_same(self, backbone: str, temporal: bool) -> None:
-        model = make_model(count=4, backbone=backbone, temporal=temporal)
-        points = self.inserted()
-        with torch.no_grad():
-            make_adapter(model).insert(points)
-        assert len(model) == 4 + len(points.positions)
+    def test_what_moves_is_inserted_halfway_in_time_and_lives_for_an_interval(self) -> None:
+        points = self.points(True)
+        halfway = points[points[:, 0] == 0.25]
+        assert len(halfway)
+        torch.testing.assert_close(halfway[:, 1], torch.full_like(halfway[:, 1], 0.5))
+        torch.testing.assert_close(halfway[:, 2], torch.full_like(halfway[:, 2], 2.5))
+
+    def test_unless_that_is_off(self) -> None:
+        assert not (self.points(False)[:, 0] == 0.25).any()
 
 
-class TestPoints:
-    def some(self, count: int, lifetimes: bool) -> Points:
-        numbers = torch.arange(float(count))
-        three = numbers[:, None].expand(-1, 3)
-        return Points(three, three, numbers, numbers, numbers, numbers + 1 if lifetimes else None)
+def trainer(motion: MotionConfig | None) -> Trainer:
+    config = replace(ALL_HOOKS, motion=motion)
 
-    def test_joined_and_selected_again_they_are_what_they_were(self) -> None:
-        first, second = self.some(3, True), self.some(2, True)
-        together = Points.joined([first, second])
-        for part, rows in ((first, slice(0, 3)), (second, slice(3, 5))):
-            again = together.select(torch.arange(5)[rows])
-            assert all(torch.equal(a, b) for a, b in zip(again, part, strict=True))
+    def attach(model: object) -> D2Hooks:
+        return D2Hooks(config, make_adapter(model), Halfway())
 
-    def test_without_a_lifetime_beside_one_with_it_has_no_end(self) -> None:
-        together = Points.joined([self.some(2, False), self.some(1, True)])
-        assert together.lifetimes.tolist() == [torch.inf, torch.inf, 1.0]
-        assert Points.joined([self.some(2, False), self.some(1, False)]).lifetimes is None
+    return Trainer(make_model(), TinyFrames(), TrainSettings(iterations=30, seed=3), attach)
+
+
+def test_a_resumed_run_is_bitwise_the_uninterrupted_one_and_not_that_without_the_hook() -> None:
+    whole, first, second, without = (trainer(MotionConfig() if i < 3 else None) for i in range(4))
+    whole.run()
+    first.run(13)
+    second.load_state_dict(first.state_dict())
+    second.run()
+    without.run()
+    assert same(parameters(whole), parameters(second))
+    assert not same(parameters(whole), parameters(without))
