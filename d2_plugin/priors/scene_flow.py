@@ -64,7 +64,7 @@ def dense_flow(image: np.ndarray, other: np.ndarray) -> np.ndarray:
     cv2 = opencv("scene flow")
     method = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     method.setFinestScale(round(math.log2(max(image.shape[1] / FINE_WIDTH, 1))))
-    flow: np.ndarray = method.calc(*(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY) for picture in (image, other)), None)
+    flow: np.ndarray = method.calc(*(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY) for rgb in (image, other)), None)
     return flow
 
 

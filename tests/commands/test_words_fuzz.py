@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import random
 import string
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -153,8 +154,10 @@ def fuzz_flags(count: int, seed: int, recording: Path, tmp_path: Path, capsys: p
             expect_an_answer([*words, f"{flag}={odd_word(rng)}"], capsys, f"flags {seed} {number}")
 
 
+@pytest.mark.parametrize("fuzz", [fuzz_flags, fuzz_words])
 @pytest.mark.parametrize(("count", "seed"), ROUNDS)
-def test_every_flag_with_odd_values(
+def test_odd_flags_and_command_lines_at_random(
+    fuzz: Callable[..., None],
     recording: Path,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
@@ -163,7 +166,7 @@ def test_every_flag_with_odd_values(
     seed: int,
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    fuzz_flags(count, seed, recording, tmp_path, capsys)
+    fuzz(count, seed, recording, tmp_path, capsys)
 
 
 @pytest.mark.parametrize(("count", "seed"), ROUNDS)
@@ -177,19 +180,6 @@ def test_the_environment_at_random(
                 changed.setenv(variable, odd_word(rng).encode("utf-8", "replace").decode())
             words = rng.choice((["doctor"], ["--help"], ["plan", str(recording), "--train-cameras", "cam00,cam01"]))
             expect_an_answer(words, capsys, f"environment {seed} {number}")
-
-
-@pytest.mark.parametrize(("count", "seed"), ROUNDS)
-def test_command_lines_at_random(
-    recording: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-    count: int,
-    seed: int,
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    fuzz_words(count, seed, recording, tmp_path, capsys)
 
 
 @pytest.mark.parametrize(("count", "seed"), ROUNDS)
