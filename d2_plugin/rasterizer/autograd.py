@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Sequence
 from types import ModuleType
 from typing import Any
 
@@ -32,7 +33,7 @@ def rasterize(
     near_edge: Tensor | None = None,
 ) -> Render:
     """See `d2_plugin.rasterizer.rasterize`."""
-    color, depth_sum, alpha, front, *_ = _Rasterize.apply(
+    color, depth_sum, alpha, front = _Rasterize.apply(
         *(part.contiguous() for part in splats[:3]),
         colors.contiguous(),
         None if background is None else background.contiguous(),
@@ -56,9 +57,19 @@ def survey(
     near_edge: Tensor | None = None,
 ) -> Survey:
     """See `d2_plugin.rasterizer.survey`."""
-    maps = (_map(part, splats.means) for part in (prior.depth, reliability(prior), near_edge))
-    parts = (part.contiguous() for part in splats[:3])
-    return _kernels(splats.means).survey(*parts, *maps, view.T_camera_world, view.K, constants_of(settings), eps)
+    means, covariances, opacities = (part.contiguous() for part in splats[:3])
+    depth, counted, edge = (_map(part, means) for part in (prior.depth, reliability(prior), near_edge))
+    kernels = _kernels(means)
+    camera = (view.T_camera_world, view.K, view.width, view.height)
+    frame = kernels.frame_of(means, covariances, opacities, *camera, constants_of(settings), 0)
+    frame.point(prior_depth=depth, reliability=counted, near_edge=edge).eps = eps
+    kernels.project(frame, means, view.K)
+    weight, error, max_weight, front = (torch.empty_like(opacities) for _ in range(4))
+    hits = torch.empty_like(opacities, dtype=torch.int32)
+    depth_sum, alpha = (opacities.new_empty(view.height, view.width) for _ in range(2))
+    frame.point(depth_sum=depth_sum, alpha=alpha, hits=hits)
+    kernels.gather(frame.point(weight=weight, error=error, max_weight=max_weight, front_weight=front), means.device)
+    return Survey(weight, error, max_weight, hits, depth_sum, alpha, front)
 
 
 @functools.lru_cache(maxsize=64)
@@ -83,18 +94,48 @@ def _kernels(part: Tensor) -> ModuleType:
 class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *inputs: Any) -> tuple[Tensor, ...]:
-        outputs: tuple[Tensor, ...] = _kernels(inputs[0]).rasterize(*inputs)
-        *tensors, _, _, ctx.constants = inputs
-        ctx.save_for_backward(*tensors, *outputs)
+        *tensors, width, height, ctx.constants = inputs
+        means, colors, K, near_edge = tensors[0], tensors[3], tensors[7], tensors[8]
+        kernels, frame = _frame(tensors, width, height, ctx.constants)
+        records, lists = kernels.project(frame, means, K)
+        color = means.new_empty(height, width, colors.shape[1])
+        depth_sum, alpha = (means.new_empty(height, width) for _ in range(2))
+        front = means.new_empty((0,) if near_edge is None else (height, width))
+        kernels.render(frame.point(color=color, depth_sum=depth_sum, alpha=alpha, front=front), means.device)
+        ctx.save_for_backward(*tensors, color, depth_sum, alpha, front, records, lists)
         ctx.set_materialize_grads(False)
-        ctx.mark_non_differentiable(*outputs[4:])
-        return outputs
+        return color, depth_sum, alpha, front
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
-        inputs, outputs = ctx.saved_tensors[:INPUTS], ctx.saved_tensors[INPUTS:]
-        upstream = [None if gradient is None else gradient.contiguous() for gradient in gradients[:4]]
-        computed = _kernels(outputs[0]).backward(*upstream, *inputs, ctx.constants, *outputs)
+        inputs, (color, depth_sum, alpha, front, records, lists) = (
+            ctx.saved_tensors[:INPUTS],
+            ctx.saved_tensors[INPUTS:],
+        )
+        means, covariances, opacities, colors = inputs[:4]
+        kernels, frame = _frame(inputs, color.shape[1], color.shape[0], ctx.constants)
+        frame.point(color=color, depth_sum=depth_sum, alpha=alpha, front=front, records=records)
+        kernels.point_lists(frame, lists)
+        upstream = [None if gradient is None else gradient.contiguous() for gradient in gradients]
+        frame.point(**dict(zip(("grad_color", "grad_depth_sum", "grad_alpha", "grad_front"), upstream)))
+        computed: list[Tensor | None] = [torch.empty_like(part) for part in (means, covariances, opacities, colors)]
+        on_screen = means.new_empty(len(means), 2)
+        names = ("grad_means", "grad_covariances", "grad_opacities", "grad_colors")
+        frame.point(**dict(zip(names, computed)), grad_screen_offsets=on_screen)
+        kernels.backward(frame, means.device)
+        on_background = None
+        if ctx.needs_input_grad[4] and upstream[0] is not None:
+            on_background = ((1 - alpha)[..., None] * upstream[0]).sum((0, 1))
+        computed += [on_background, on_screen]
         wanted = (gradient if asked else None for gradient, asked in zip(computed, ctx.needs_input_grad))
         return (*wanted, *(None for _ in range(len(ctx.needs_input_grad) - len(computed))))
+
+
+def _frame(inputs: Sequence[Tensor], width: int, height: int, constants: list[float]) -> tuple[ModuleType, Any]:
+    means, covariances, opacities, colors, background, screen_offsets, *camera, near_edge = inputs
+    kernels = _kernels(means)
+    frame = kernels.frame_of(means, covariances, opacities, *camera, width, height, constants, colors.shape[1])
+    return kernels, frame.point(
+        colors=colors, background=background, screen_offsets=screen_offsets, near_edge=near_edge
+    )

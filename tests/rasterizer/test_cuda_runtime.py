@@ -152,16 +152,17 @@ def test_a_driver_that_refuses_the_kernels_is_named(shim_driver: ctypes.CDLL, mo
 def test_a_grid_that_no_device_launches_is_one_sentence(shim_driver: ctypes.CDLL, grid: tuple[int, int]) -> None:
     launcher = cuda.CudaLauncher(torch.device("cuda", 0))
     with pytest.raises(D2Error, match=rf"a grid of {grid[0]} x {grid[1]} blocks, at most 2147483647 x 65535"):
-        launcher.launch("d2_project", grid[0], cuda._frame(*empty_scene()), rows=grid[1])
+        launcher.launch("d2_project", grid[0], cuda.frame_of(*empty_scene()), rows=grid[1])
     assert shim_driver.d2_shim_contexts() == 0
 
 
 def test_a_launch_of_nothing_never_reaches_the_driver(shim_driver: ctypes.CDLL) -> None:
     """Which refuses an empty grid, as the real one does."""
-    cuda.CudaLauncher(torch.device("cuda", 0)).launch("d2_project", 0, cuda._frame(*empty_scene()))
+    cuda.CudaLauncher(torch.device("cuda", 0)).launch("d2_project", 0, cuda.frame_of(*empty_scene()))
 
 
 def empty_scene() -> tuple:
     """Arguments of a frame without Gaussians."""
     means, covariances, opacities = torch.zeros(0, 3), torch.zeros(0, 6), torch.zeros(0)
-    return means, covariances, opacities, torch.eye(4), torch.eye(3), 16, 16, [0.2, 0.3, 0.99, 1 / 255, 1e-4, 1.3, 0.0]
+    constants = [0.2, 0.3, 0.99, 1 / 255, 1e-4, 1.3, 0.0]
+    return means, covariances, opacities, torch.eye(4), torch.eye(3), 16, 16, constants, 0

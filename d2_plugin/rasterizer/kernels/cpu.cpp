@@ -292,11 +292,8 @@ static void render_tile(const Frame& f, int tile) {
 // State of a block in the backward pass: transmittance, what is left of sum of w dL/dw, and dL/d of alpha (with the
 // background's share), depth sum and colors at its pixels; with FRONT the free space (2), scaled by dL/d(front).
 template <int FIXED, bool FRONT>
-static void load_gradients(const Frame& f, int tile, float* state, float* background) {
+static void load_gradients(const Frame& f, int tile, float* state) {
   const int channels = FIXED ? FIXED : f.channels, space = 4 + channels, fields = space + (FRONT ? 2 : 0);
-  Floats background_sums[FIXED ? FIXED : 1];
-  for (int c = 0; c < FIXED; c++) background_sums[c] = Floats(0.f);
-  if (background) std::fill(background, background + channels, 0.f);
   for_each_block(f, tile, [&](int block, const Patch& patch, auto whole) {
     float* field = state + block * fields * LANES;
     const Floats alpha = load_plane<whole>(f.alpha, patch);
@@ -324,11 +321,6 @@ static void load_gradients(const Frame& f, int tile, float* state, float* backgr
         on_color.store(field + (4 + c) * LANES);
         // The image holds (1 - A) background: part of the dependence on alpha, not of the sum over Gaussians.
         on_alpha = fnma(on_color, behind, on_alpha);
-        if (background) {
-          const Floats seen_behind = (Floats(1.f) - alpha) * given;
-          if (FIXED) background_sums[FIXED ? c : 0] = background_sums[FIXED ? c : 0] + seen_behind;
-          else background[c] += sum(seen_behind);
-        }
       });
       load_channels<FIXED, whole>(f.color, channels, patch, [&](int c, Floats color) {
         total = fma(Floats::load(field + (4 + c) * LANES), color - Floats(f.background[c]), total);
@@ -339,13 +331,12 @@ static void load_gradients(const Frame& f, int tile, float* state, float* backgr
     on_alpha.store(field + 2 * LANES);
     on_depth.store(field + 3 * LANES);
   });
-  for (int c = 0; background && c < FIXED; c++) background[c] = sum(background_sums[c]);
 }
 
 // Where the tiles of one call put their sums: `Scratch` of the thread that calls.
 struct Sums {
   uint8_t* touched;
-  float *moments, *background;
+  float* moments;
 };
 
 template <int FIXED, bool FRONT>
@@ -353,7 +344,7 @@ static void backward_tile(const Frame& f, int tile, const Sums& to) {
   const int channels = FIXED ? FIXED : f.channels, free = 4 + channels, fields = free + (FRONT ? 2 : 0);
   float* state = scratch().state.reserve(size_t(BLOCKS * fields + 7 + channels) * LANES);
   Floats* loose_sums = reinterpret_cast<Floats*>(state + BLOCKS * fields * LANES);
-  load_gradients<FIXED, FRONT>(f, tile, state, to.background ? to.background + int64_t(tile) * channels : nullptr);
+  load_gradients<FIXED, FRONT>(f, tile, state);
   const Corner corner = corner_of(f, tile);
   const Lattice lattice;
   const float log2_alpha_min = f.log2_alpha_min(), log2_alpha_max = f.log2_alpha_max();
@@ -578,19 +569,12 @@ static void survey(const Frame& f, int64_t pairs) {
 static void backward(const Frame& f, int64_t pairs) {
   const int tiles = f.tile_count();
   const int64_t stride = moment_stride(f.channels);
-  Sums sums = {scratch().touched.reserve(pairs), scratch().moments.reserve(pairs * stride), nullptr};
-  if (f.grad_background) sums.background = scratch().background.reserve(size_t(tiles) * f.channels);
+  const Sums sums = {scratch().touched.reserve(pairs), scratch().moments.reserve(pairs * stride)};
   std::fill(sums.touched, sums.touched + pairs, 0);
   const bool front = f.near_edge && f.grad_front;
   const auto backward_any = f.channels == 3 ? (front ? backward_tile<3, true> : backward_tile<3, false>)
                                             : (front ? backward_tile<0, true> : backward_tile<0, false>);
   parallel_for(f.threads, tiles, [&](int64_t tile) { backward_any(f, int(tile), sums); });
-  if (f.grad_background)
-    for (int c = 0; c < f.channels; c++) {
-      double total = 0;
-      for (int tile = 0; tile < tiles; tile++) total += sums.background[int64_t(tile) * f.channels + c];
-      f.grad_background[c] = float(total);
-    }
   parallel_for(f.threads, f.chunks, [&](int64_t chunk) {
     float* totals = scratch().state.reserve(size_t(LANES) * stride);
     const int64_t end = f.chunk_begin(chunk + 1);

@@ -66,8 +66,8 @@ struct Frame {
   float *color, *depth_sum, *alpha, *front;
   const float *grad_color, *grad_depth_sum, *grad_alpha, *grad_front;
 
-  // Gradients; the last two may be null.
-  float *grad_means, *grad_covariances, *grad_opacities, *grad_colors, *grad_screen_offsets, *grad_background;
+  // Gradients; the last may be null.
+  float *grad_means, *grad_covariances, *grad_opacities, *grad_colors, *grad_screen_offsets;
 
   // Survey.
   float *weight, *error, *max_weight, *front_weight;
@@ -124,7 +124,6 @@ struct Scratch {
   Buffer<int32_t> counts;           // [chunks, tiles + 1] pairs per tile, then where they go; last: pairs of the chunk
   Buffer<uint8_t> touched;          // [pairs] whether the slot was written
   Buffer<float> moments;            // [pairs, stride] per slot: Moments, then dL/d color
-  Buffer<float> background;         // [tiles, channels] parts of dL/d background
   Buffer<Statistics> statistics;    // [pairs] per slot
 
   Buffer<uint64_t> keys, spare;     // [pairs of the tile]
