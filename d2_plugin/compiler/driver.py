@@ -5,7 +5,8 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import sys
-from collections.abc import Iterator
+import threading
+from collections.abc import Callable, Iterator
 
 import torch
 
@@ -17,13 +18,18 @@ LARGEST_GRID = (2**31 - 1, 65535)
 
 
 class Driver:
-    """One CUDA device, in the context that torch works in."""
+    """A program's kernels on one CUDA device, in the context that torch works in, by variants of their compilation."""
 
-    def __init__(self, device: torch.device) -> None:
-        """Find the driver and the device's context.
+    def __init__(self, device: torch.device, build: Callable[[int, int], Binary], variant: int) -> None:
+        """Find the driver and the device's context, and load a first variant.
+
+        Args:
+            device: with an index.
+            build: compute capability (90 is sm_90) and variant to what NVRTC makes of the program.
+            variant: to compile now, so that what is missing is known before the first launch.
 
         Raises:
-            NoCuda: no driver, or no NVIDIA GPU.
+            NoCuda: no driver, no NVIDIA GPU, no NVRTC, or an architecture that it does not know.
         """
         if torch.version.hip:
             raise NoCuda(f"{device} is an AMD GPU, the kernels are for NVIDIA's: use the CPU")
@@ -32,13 +38,18 @@ class Driver:
         major, minor = torch.cuda.get_device_capability(device)
         self.capability = 10 * major + minor
         self._context = self._primary_context()
+        self._build, self._guard = build, threading.Lock()
+        self._modules: dict[int, ctypes.c_void_p] = {}
+        self._functions: dict[tuple[str, int], ctypes.c_void_p] = {}
+        self._module(variant)
 
-    def module(self, binary: Binary) -> ctypes.c_void_p:
-        """The kernels of a binary, on the device.
+    def _module(self, variant: int) -> ctypes.c_void_p:
+        with self._guard:
+            if variant not in self._modules:
+                self._modules[variant] = self._loaded(self._build(self.capability, variant))
+            return self._modules[variant]
 
-        Raises:
-            NoCuda: the driver refuses them.
-        """
+    def _loaded(self, binary: Binary) -> ctypes.c_void_p:
         module = ctypes.c_void_p()
         with self._current():
             result = self._driver.cuModuleLoadData(ctypes.byref(module), binary.code)
@@ -49,20 +60,23 @@ class Driver:
             )
         return module
 
-    def function(self, module: ctypes.c_void_p, kernel: str) -> ctypes.c_void_p:
-        """A kernel of a module."""
-        function = ctypes.c_void_p()
-        with self._current():
-            self._check(self._driver.cuModuleGetFunction(ctypes.byref(function), module, kernel.encode()))
-        return function
+    def _function(self, kernel: str, variant: int) -> ctypes.c_void_p:
+        key = (kernel, variant)
+        if key not in self._functions:
+            module, function = self._module(variant), ctypes.c_void_p()
+            with self._current():
+                self._check(self._driver.cuModuleGetFunction(ctypes.byref(function), module, kernel.encode()))
+            self._functions[key] = function
+        return self._functions[key]
 
     def launch(
-        self, function: ctypes.c_void_p, grid: tuple[int, int], threads: int, argument: ctypes.Structure
+        self, kernel: str, variant: int, grid: tuple[int, int], threads: int, argument: ctypes.Structure
     ) -> None:
         """Enqueue a kernel with one argument on torch's current stream; returns before it has run.
 
         Raises:
             D2Error: more blocks than a grid may have, or what the driver says.
+            NoCuda: the variant cannot be compiled.
         """
         if 0 in grid:
             return
@@ -71,6 +85,7 @@ class Driver:
                 f"a grid of {grid[0]} x {grid[1]} blocks, at most {LARGEST_GRID[0]} x {LARGEST_GRID[1]} can be "
                 "launched: use fewer Gaussians or a smaller image"
             )
+        function = self._function(kernel, variant)
         stream = ctypes.c_void_p(torch.cuda.current_stream(self.device).cuda_stream)
         parameters = (ctypes.c_void_p * 1)(ctypes.addressof(argument))
         with self._current():

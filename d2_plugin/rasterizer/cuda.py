@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import ctypes
 import functools
-import threading
 import warnings
 from typing import Protocol
 
@@ -104,33 +103,12 @@ class CudaLauncher:
     """Launches the kernels on one CUDA device, on torch's current stream."""
 
     def __init__(self, device: torch.device) -> None:
-        """Compile (or find) the kernels for `device` and load them.
-
-        Raises:
-            NoCuda: no driver, no NVRTC, or an architecture that it does not know.
-        """
-        self._driver = Driver(device)
-        self._functions: dict[tuple[str, int], ctypes.c_void_p] = {}
-        self._modules: dict[int, ctypes.c_void_p] = {}
-        self._guard = threading.Lock()
-        self._module(CACHED_CHANNELS)
+        """Compile (or find) the kernels for `device`, as `Driver` does."""
+        self._driver = Driver(device, lambda *variant: binary_for(*variant), CACHED_CHANNELS)
 
     def launch(self, kernel: str, blocks: int, frame: Frame, rows: int = 1) -> None:
         """See `Launcher.launch`; returns before the kernel has run."""
-        function = self._function(kernel, frame.channels or CACHED_CHANNELS)
-        self._driver.launch(function, (blocks, rows), THREADS, frame)
-
-    def _function(self, kernel: str, channels: int) -> ctypes.c_void_p:
-        key = (kernel, channels)
-        if key not in self._functions:
-            self._functions[key] = self._driver.function(self._module(channels), kernel)
-        return self._functions[key]
-
-    def _module(self, channels: int) -> ctypes.c_void_p:
-        with self._guard:
-            if channels not in self._modules:
-                self._modules[channels] = self._driver.module(binary_for(self._driver.capability, channels))
-            return self._modules[channels]
+        self._driver.launch(kernel, frame.channels or CACHED_CHANNELS, (blocks, rows), THREADS, frame)
 
 
 @functools.cache

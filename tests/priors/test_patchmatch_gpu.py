@@ -29,16 +29,16 @@ SETTINGS = StereoSettings()
 CPU = replace(SETTINGS, patchmatch_device="cpu")
 
 
-class ShimLauncher:
+class ShimDriver:
     """Runs the kernels on the CPU, with blocks, warps and lanes in an order of `cuda_shim.h`."""
 
     def __init__(self, order: int = 0) -> None:
         self.order = order
         self.launched: set[str] = set()
 
-    def launch(self, kernel: str, sources: int, blocks: int, call: Call) -> None:
+    def launch(self, kernel: str, sources: int, grid: tuple[int, int], threads: int, call: Call) -> None:
         self.launched.add(kernel)
-        error = shim_library(sources).d2_shim_launch(kernel.encode(), blocks, self.order, ctypes.byref(call))
+        error = shim_library(sources).d2_shim_launch(kernel.encode(), grid[0], self.order, ctypes.byref(call))
         assert error is None, error.decode()
 
 
@@ -57,12 +57,12 @@ def rig() -> Rig:
     return textured_rig(3, width=64, height=37, seed=3)
 
 
-def use_shim(monkeypatch: pytest.MonkeyPatch, order: int = 0) -> ShimLauncher:
-    launcher = ShimLauncher(order)
+def use_shim(monkeypatch: pytest.MonkeyPatch, order: int = 0) -> ShimDriver:
+    driver = ShimDriver(order)
     monkeypatch.setattr(gpu, "why_not_usable", lambda: None)
     monkeypatch.setattr(gpu, "current_device", lambda: torch.device("cpu"))
-    monkeypatch.setattr(gpu, "launcher", lambda device: launcher)
-    return launcher
+    monkeypatch.setattr(gpu, "driver", lambda device: driver)
+    return driver
 
 
 @pytest.fixture(params=["shim", pytest.param("cuda", marks=pytest.mark.cuda)])
@@ -154,11 +154,11 @@ def test_no_result_depends_on_the_order_of_blocks_warps_and_lanes(rig: Rig, monk
     results = []
     for order in (0, 1, 2):
         try:
-            launcher = use_shim(monkeypatch, order)
+            driver = use_shim(monkeypatch, order)
             results.append(patchmatch(grays(rig)[:2], rig.cameras[:2], rig.depth_range, SETTINGS))
         except NoCompiler as error:
             pytest.skip(str(error))
-        assert launcher.launched == {f"d2_patchmatch_{name}" for name in ("begin", "update", "average")}
+        assert driver.launched == {f"d2_patchmatch_{name}" for name in ("begin", "update", "average")}
     for other in results[1:]:
         assert_same(other, results[0])
 

@@ -56,42 +56,14 @@ LEAST_SOURCES = 2
 """The kernels compiled for so many sources also average planes, which needs none."""
 
 
-class CudaLauncher:
-    """Launches the kernels on one CUDA device, on torch's current stream."""
-
-    def __init__(self, device: torch.device) -> None:
-        """Compile (or find) the kernels and load them.
-
-        Raises:
-            NoCuda: no driver, no NVRTC, or an architecture that it does not know.
-        """
-        self._driver = Driver(device)
-        self._functions: dict[tuple[str, int], ctypes.c_void_p] = {}
-        self._modules: dict[int, ctypes.c_void_p] = {}
-        self._module(LEAST_SOURCES)
-
-    def launch(self, kernel: str, sources: int, blocks: int, call: Call) -> None:
-        """Enqueue `kernel`, compiled for that many sources, on `blocks` blocks of THREADS threads; `call` is copied."""
-        key = (kernel, sources)
-        if key not in self._functions:
-            self._functions[key] = self._driver.function(self._module(sources), kernel)
-        self._driver.launch(self._functions[key], (blocks, 1), THREADS, call)
-
-    def _module(self, sources: int) -> ctypes.c_void_p:
-        if sources not in self._modules:
-            binary = build("patchmatch", PROGRAM, flags_for(sources), self._driver.capability)
-            self._modules[sources] = self._driver.module(binary)
-        return self._modules[sources]
-
-
 @functools.cache
-def launcher(device: torch.device) -> CudaLauncher:
-    """The launcher of a CUDA device; `device` has an index.
+def driver(device: torch.device) -> Driver:
+    """The kernels on a CUDA device, compiled for so many sources of a view; `device` has an index.
 
     Raises:
         NoCuda: no driver, no NVRTC, or an architecture that it does not know.
     """
-    return CudaLauncher(device)
+    return Driver(device, lambda sm, sources: build("patchmatch", PROGRAM, flags_for(sources), sm), LEAST_SOURCES)
 
 
 @functools.cache
@@ -100,7 +72,7 @@ def why_not_usable() -> str | None:
     if not torch.cuda.is_available():
         return "torch sees no CUDA device"
     try:
-        launcher(current_device())
+        driver(current_device())
     except NoCuda as error:
         return str(error)
     return None
@@ -115,16 +87,16 @@ class CudaPatchMatchKernel(PatchMatchKernel):
 
     def _start(self) -> None:
         self.device = current_device()
-        self._launcher = launcher(self.device)
+        self._driver = driver(self.device)
 
     def _spread(self, task: Task, arrays: Arrays) -> None:
         on_device = self._moved(task, arrays)
         call = Call(task=task)
         pixels, half = task.width * task.height, -(-task.width // 2) * task.height
-        self._launcher.launch("d2_patchmatch_begin", task.source_count, _blocks(pixels), call)
+        self._launch("d2_patchmatch_begin", task.source_count, pixels, call)
         for call.round in range(task.rounds):
             for call.colour in (0, 1):
-                self._launcher.launch("d2_patchmatch_update", task.source_count, _blocks(half), call)
+                self._launch("d2_patchmatch_update", task.source_count, half, call)
         for name in ("planes", "costs"):
             arrays[name][...] = on_device[name].cpu().numpy()
 
@@ -135,9 +107,12 @@ class CudaPatchMatchKernel(PatchMatchKernel):
             task.planes = planes.data_ptr()
             call = Call(task=task, radius=CONSENSUS_RADIUS, averaged=averaged.data_ptr())
             call.tolerance = CONSENSUS_TOLERANCE
-            self._launcher.launch("d2_patchmatch_average", LEAST_SOURCES, _blocks(task.width * task.height), call)
+            self._launch("d2_patchmatch_average", LEAST_SOURCES, task.width * task.height, call)
             planes, averaged = averaged, planes
         return planes.cpu().numpy()
+
+    def _launch(self, kernel: str, sources: int, count: int, call: Call) -> None:
+        self._driver.launch(kernel, sources, (-(-count // THREADS), 1), THREADS, call)
 
     def _moved(self, task: Task, arrays: Arrays) -> dict[str, torch.Tensor]:
         """Copies of the arrays on the device, which the task points to then; they must outlive its use."""
@@ -152,7 +127,3 @@ class CudaPatchMatchKernel(PatchMatchKernel):
 def current_device() -> torch.device:
     """Torch's current CUDA device, with its index."""
     return torch.device("cuda", torch.cuda.current_device())
-
-
-def _blocks(threads: int) -> int:
-    return -(-threads // THREADS)
