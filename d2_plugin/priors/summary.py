@@ -8,6 +8,8 @@ from pathlib import Path
 from statistics import fmean, median
 from typing import Any
 
+from d2_plugin.priors.monocular.uncertainty import NIL
+
 SHOWN = {label: label for label in ("verified", "agreed", "mono", "far", "conflict", "empty")} | {"mono": "mono only"}
 """Columns of the summary: label and title."""
 
@@ -17,7 +19,7 @@ USED = ("verified", "agreed", "mono", "far")
 DECLARED = ("verified", "agreed", "mono")
 """Labels that also show a median sigma."""
 
-TOLD = ("shares", "sigmas", "refused")
+KEPT = ("shares", "sigmas", "refused", "skill")
 """What of a record the summary keeps."""
 
 
@@ -28,7 +30,7 @@ class PriorSummary:
     built: int = 0
     kept: int = 0
     views: dict[tuple[str, int], dict[str, Any]] = field(default_factory=dict)
-    """What the record of each view says of its `shares`, `sigmas` and `refused`, by camera and frame."""
+    """What the record of each view says of its `shares`, `sigmas`, `refused` and `skill`, by camera and frame."""
     notes: list[str] = field(default_factory=list)
     folder: Path | None = None
     """Where the priors are: the output, or a folder of their own in it, beside the priors of other cameras."""
@@ -36,7 +38,7 @@ class PriorSummary:
     def add(self, camera: str, frame: int, record: dict[str, Any], built: bool) -> None:
         """Take one view's record into account."""
         self.built, self.kept = self.built + built, self.kept + (not built)
-        self.views[camera, frame] = {"sigmas": {}} | {name: record[name] for name in TOLD if name in record}
+        self.views[camera, frame] = {"sigmas": {}} | {name: record[name] for name in KEPT if name in record}
 
     def add_part(self, part: PriorSummary) -> None:
         """Take in the summary of another part of the same build; notes that both have are kept once."""
@@ -85,6 +87,16 @@ class PriorSummary:
         counts = Counter(reason for _, _, reason in self.refused)
         return "; ".join(f"{count}x {reason}" for reason, count in counts.most_common())
 
+    def skill(self) -> str:
+        """How good the monocular maps are where anchors were left out, in one line; empty where none were."""
+        skills = [skill for view in self.views.values() if (skill := view.get("skill")) and skill["error"] is not None]
+        if not skills:
+            return ""
+        error = median(skill["error"] for skill in skills)
+        without = median(skill["error"] * (skill["gain"] or 1.0) for skill in skills)
+        verdict = "" if without > NIL * error else ": they say no more than the stereo around"
+        return f"{error:.1%} off where stereo was left out (median), {without:.1%} without any map{verdict}"
+
     def headline(self) -> str:
         """The prior in one line: how many views have one, which cameras have none, and every reason of a refusal."""
         used = {camera: self._used(camera) for camera in self._cameras()}
@@ -110,6 +122,7 @@ class PriorSummary:
 
     def __str__(self) -> str:
         lines = [f"{self.built} priors built, {self.kept} kept", *self._share_lines(), *self._sigma_lines()]
+        lines += [f"monocular maps: {said}"] if (said := self.skill()) else []
         reasons = Counter(reason for _, _, reason in self.refused)
         for reason, count in reasons.most_common():
             examples = [f"{camera}/{frame}" for camera, frame, why in self.refused if why == reason][:3]

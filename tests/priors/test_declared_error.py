@@ -118,6 +118,18 @@ def test_the_summary_shows_median_sigma_and_parts_add_up() -> None:
     far.add("b", 1, {"shares": nothing["shares"] | {"far": 1.0}, "refused": ""}, False)
     paper.add_part(far)
     assert paper.headline().startswith("prior: 2 of 3 views are usable; maps")
+    assert "monocular maps" not in str(paper)
+
+
+def test_the_summary_says_whether_monocular_maps_know_more_than_the_stereo_around() -> None:
+    for gain, ending in ((2.0, "8.0% without any map"), (0.5, "they say no more than the stereo around")):
+        summary = PriorSummary()
+        skill = {"scale": 1.0, "error": 0.04, "gain": gain, "tail": 1.0}
+        shares = {label.name.lower(): 0.0 for label in Label}
+        summary.add("a", 0, {"shares": shares, "refused": "", "skill": skill}, True)
+        summary.add("a", 1, {"shares": shares, "refused": "", "skill": skill | {"error": None, "gain": None}}, True)
+        line = next(line for line in str(summary).splitlines() if line.startswith("monocular maps: 4.0% off"))
+        assert line.endswith(ending)
 
 
 def test_a_rounded_truth_is_told_by_its_steps_and_an_exact_one_is_not() -> None:
