@@ -35,7 +35,7 @@ class StereoBench(Settings):
     data: Path | None = None
     """Folder with the recordings studio/ and middlebury/."""
     makers: tuple[str, ...] = ()
-    """Matchers, of patchmatch, sgbm and colmap (which needs CUDA); all that run here if not given."""
+    """Matchers, of patchmatch and sgbm; all if not given."""
     defaults_only: bool = False
     """Leave out what is varied about a matcher."""
     width: Annotated[int, Range(32, unit="pixels")] = 320

@@ -12,14 +12,12 @@ import numpy as np
 
 from benchmarks.stereo_rigs import Rig
 from d2_plugin.errors import D2Error
-from d2_plugin.priors.colmap.mvs import why_not_usable
 from d2_plugin.priors.settings import StereoSettings
 from d2_plugin.priors.stereo.filtering.filter import GeometricDepth, filter_depths
 from d2_plugin.priors.stereo.geometric_depth import MATCHERS, Matcher, gray
 
 VARIANTS: dict[str, dict[str, dict[str, Any]]] = {
     "patchmatch": {"default": {}, "2 sources": {"patchmatch_sources": 2}},
-    "colmap": {"default": {}, "photometric pass alone": {"colmap_geometric": False}},
 }
 """What is varied about each matcher of this package: its settings that are not the default."""
 
@@ -40,7 +38,6 @@ def methods() -> list[Method]:
     return [
         Method(name, setting, MATCHERS[name], replace(default, **changes))
         for name, variants in VARIANTS.items()
-        if name != "colmap" or not why_not_usable()
         for setting, changes in variants.items()
     ]
 

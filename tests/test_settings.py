@@ -205,7 +205,7 @@ def every_settings_class() -> list[type[Settings]]:
     packages = [d2_plugin, importlib.import_module("d2_plugin.backbones")]
     for package in packages:
         for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
-            if not module.name.endswith(("__main__", "mvs_process")):
+            if not module.name.endswith("__main__"):
                 importlib.import_module(module.name)
     found, left = [], [Settings]
     while left:

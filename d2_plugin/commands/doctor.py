@@ -62,7 +62,6 @@ def report() -> str:
     import torch
 
     from d2_plugin.compiler.gpu_state import gpu_state
-    from d2_plugin.priors.colmap import mvs as colmap_mvs
 
     lines = [
         f"d2-4dgs {__version__}, Python {platform.python_version()}, torch {torch.__version__}, {os.cpu_count()} cores",
@@ -72,7 +71,7 @@ def report() -> str:
         f"backbones   {', '.join(registry.names(registry.BACKBONES))}",
     ]
     lines += [f"{module:12}{_state(module, extra, purpose)}" for module, (extra, purpose) in OPTIONAL.items()]
-    return "\n".join([*lines, f"{'COLMAP':12}{colmap_mvs.why_not_usable() or 'PatchMatch on CUDA'}"])
+    return "\n".join(lines)
 
 
 def _compiler() -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,13 +14,14 @@ from prior_cases import write_dense_array
 from d2_plugin.errors import D2Error
 from d2_plugin.priors import depth_on_disk
 from d2_plugin.priors.build import build_priors
-from d2_plugin.priors.colmap.mvs import write_model
 from d2_plugin.priors.colmap.workspace import WorkspaceDepth, scale_of_world, seen_by
 from d2_plugin.priors.depth_on_disk import DepthOnDisk, SensorDepth, find_depth_on_disk
 from d2_plugin.priors.frame import Frame
+from d2_plugin.priors.geometry import index_intrinsics
 from d2_plugin.priors.settings import PriorSettings, StereoSettings
 from d2_plugin.protocol import Label
 from d2_plugin.recordings.cameras.camera import pinhole
+from d2_plugin.recordings.cameras.rotations import quaternion_of_rotation
 from d2_plugin.recordings.recording import Camera, Recording
 from d2_plugin.recordings.selection import downscale
 from d2_plugin.recordings.synthetic.room import synthetic_recording
@@ -77,11 +79,21 @@ def write_maps(recording: Recording, place: str, frame: int, scale: float = 1.0,
         cameras.append(replace(camera, T_camera_world=pose))
         write_dense_array(maps / f"{camera.name}.png.{kind}.bin", recording.depth(camera.name, frame) * scale)
     write_model(folder / "sparse", cameras)
-    images = (folder / "sparse" / "images.txt").read_text()
-    for index, camera in enumerate(cameras):
-        images = images.replace(f"{index:04d}.png", f"{camera.name}.png")
-    (folder / "sparse" / "images.txt").write_text(images)
     return folder
+
+
+def write_model(folder: Path, cameras: Sequence[Camera]) -> None:
+    """COLMAP's text model of known cameras without points. Its PatchMatch takes K in array indices."""
+    lenses, images = [], []
+    for index, camera in enumerate(cameras, 1):
+        K = index_intrinsics(camera)
+        numbers = " ".join(repr(float(value)) for value in (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
+        lenses.append(f"{index} PINHOLE {camera.width} {camera.height} {numbers}\n")
+        pose = (*quaternion_of_rotation(camera.T_camera_world[:3, :3]), *camera.T_camera_world[:3, 3])
+        images.append(f"{index} {' '.join(repr(float(v)) for v in pose)} {index} {camera.name}.png\n\n")
+    (folder / "cameras.txt").write_text("".join(lenses))
+    (folder / "images.txt").write_text("".join(images))
+    (folder / "points3D.txt").write_text("")
 
 
 def workspace(recording: Recording, place: str = "") -> WorkspaceDepth:
@@ -279,12 +291,10 @@ def test_images_of_all_frames_may_share_one_workspace(recording: Recording) -> N
 def test_maps_of_the_geometric_pass_come_first(still: Recording) -> None:
     folder = write_maps(still, "colmap", 0)
     write_dense_array(folder / "stereo" / "depth_maps" / "train0.png.photometric.bin", np.ones((90, 160)))
-    depth = [
-        find_depth_on_disk(still, NAMES, StereoSettings(colmap_geometric=wanted)).depth(still.cameras["train0"], 0)
-        for wanted in (True, False)
-    ]
-    assert np.median(depth[0]) > 1.5
-    assert (depth[1] == 1).all()
+    source = find_depth_on_disk(still, NAMES, StereoSettings())
+    assert np.median(source.depth(still.cameras["train0"], 0)) > 1.5
+    (folder / "stereo" / "depth_maps" / "train0.png.geometric.bin").unlink()
+    assert (source.depth(still.cameras["train0"], 0) == 1).all()
 
 
 def test_a_map_of_another_size_and_lens_is_looked_up_ray_by_ray(recording: Recording) -> None:
@@ -381,6 +391,6 @@ def test_depth_that_is_asked_for_and_absent_is_told(recording: Recording, matche
 )
 def test_braces_never_fill_the_memory_or_look_things_up(place: str, tmp_path: Path) -> None:
     camera = Camera("a", 8, 6, np.eye(3), np.eye(4))
-    source = WorkspaceDepth(tmp_path, place, StereoSettings(), [camera], [0])
+    source = WorkspaceDepth(tmp_path, place, [camera], [0])
     with pytest.raises(D2Error, match="braces around other than frame"):
         source.has_maps(0)

@@ -82,9 +82,8 @@ def test_only_what_cannot_be_made_again_waits_for_the_disk(tmp_path: Path, monke
 @pytest.mark.parametrize(
     ("change", "voids"),
     [
-        ({"max_pixels": 10_000}, {"patchmatch", "colmap"}),
+        ({"max_pixels": 10_000}, {"patchmatch"}),
         ({"seed": 1}, {"patchmatch"}),
-        ({"colmap_geometric": False}, {"colmap"}),
         ({"reuse_block": 7}, set()),
         ({"patchmatch_device": "cpu"}, set()),
     ],
@@ -93,6 +92,6 @@ def test_maps_are_made_anew_where_a_setting_changed_that_they_depend_on_and_kept
     tmp_path: Path, change: dict[str, object], voids: set[str]
 ) -> None:
     settings = replace(StereoSettings(), **change)
-    for matcher in ("patchmatch", "colmap"):
+    for matcher in ("patchmatch", "workspace"):
         key, other = (Computed(tmp_path, chosen, matcher).key(FRAME) for chosen in (None, settings))
         assert (key != other) == (matcher in voids), matcher

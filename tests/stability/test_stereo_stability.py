@@ -9,10 +9,9 @@ import pytest
 
 from d2_plugin.compiler import NoCompiler, find_compiler
 from d2_plugin.errors import D2Error
-from d2_plugin.priors.colmap.mvs import why_not_usable
 from d2_plugin.priors.settings import StereoSettings
 from d2_plugin.priors.stereo.depth_range import depth_bounds
-from d2_plugin.priors.stereo.geometric_depth import geometric_depth
+from d2_plugin.priors.stereo.geometric_depth import MATCHERS, geometric_depth
 from d2_plugin.recordings.recording import Camera
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 
@@ -21,16 +20,12 @@ pytest.importorskip("cv2")
 BOUNDS = (2.0, 9.0)
 
 
-@pytest.fixture(params=["patchmatch", "colmap"])
+@pytest.fixture(params=list(MATCHERS))
 def matcher(request: pytest.FixtureRequest) -> str:
-    """Every matcher that this machine has."""
-    if request.param == "patchmatch":
-        try:
-            find_compiler()
-        except NoCompiler:
-            pytest.skip("there is no C++ compiler for patchmatch")
-    if request.param == "colmap" and (reason := why_not_usable()):
-        pytest.skip(f"COLMAP's PatchMatch cannot run: {reason}")
+    try:
+        find_compiler()
+    except NoCompiler:
+        pytest.skip("there is no C++ compiler for patchmatch")
     return request.param
 
 

@@ -39,6 +39,9 @@ FRAME_IN_BRACES = re.compile(r"\{frame(?::0?[0-9]{1,2}d?)?\}")
 HEADER = re.compile(rb"(\d{1,9})&(\d{1,9})&(\d{1,2})&")
 HEADER_LENGTH = 64  # bytes, more than any header has
 
+KINDS = ("geometric", "photometric")
+"""COLMAP's maps of a view: those of the pass that asks the other views' depths are taken where there are any."""
+
 logger = logging.getLogger(__name__)
 
 
@@ -48,7 +51,6 @@ class WorkspaceDepth:
     Args:
         root: folder that `place` is relative to.
         place: path of the workspace; `{frame}` in it stands for the frame number.
-        settings: `colmap_geometric` says whether maps of the geometric pass are wanted where there are any.
         cameras: the cameras whose poses are compared.
         frames: of the recording. Where there are several, an image serves only the frame that its name tells: a
             workspace of one instant, as many recordings have for their initial points, must not become the depth of all
@@ -57,12 +59,9 @@ class WorkspaceDepth:
 
     name: ClassVar[str] = "workspace"
 
-    def __init__(
-        self, root: Path, place: str, settings: StereoSettings, cameras: Sequence[Camera], frames: Sequence[int]
-    ) -> None:
+    def __init__(self, root: Path, place: str, cameras: Sequence[Camera], frames: Sequence[int]) -> None:
         self.root, self.place, self.cameras = root, place, list(cameras)
         self.one_instant = "{frame" in place or len(frames) == 1
-        self.kinds = ("geometric", "photometric") if settings.colmap_geometric else ("photometric",)
         self.about = f"depth maps of the COLMAP workspace {place}"
         self._read: Path | None = None
         self._compared: Path | None = None
@@ -80,7 +79,7 @@ class WorkspaceDepth:
         Where the settings do not name it, it must serve the first frame and the last.
         """
         for place in [settings.folder] if settings.folder else PLACES:
-            source = cls(root, place, settings, cameras, frames)
+            source = cls(root, place, cameras, frames)
             chosen = settings.matcher == cls.name and any(source.has_maps(frame) for frame in frames)
             if chosen or all(source.serves(frame) for frame in (frames[0], frames[-1])):
                 return source
@@ -160,7 +159,7 @@ class WorkspaceDepth:
         return self._images.get((camera, None)) if image is None and self.one_instant else image
 
     def _map(self, folder: Path, name: str) -> Path | None:
-        paths = (folder / "stereo" / "depth_maps" / f"{name}.{kind}.bin" for kind in self.kinds)
+        paths = (folder / "stereo" / "depth_maps" / f"{name}.{kind}.bin" for kind in KINDS)
         return next((path for path in paths if path.is_file()), None)
 
 

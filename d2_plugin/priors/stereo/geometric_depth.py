@@ -9,7 +9,6 @@ from dataclasses import replace
 import numpy as np
 
 from d2_plugin.errors import D2Error, unknown_name
-from d2_plugin.priors.colmap import mvs
 from d2_plugin.priors.extras import opencv
 from d2_plugin.priors.geometry import check_depth_range, check_views, scaled_camera
 from d2_plugin.priors.stereo.filtering.filter import GeometricDepth, filter_depths
@@ -29,14 +28,11 @@ Matcher = Callable[..., list[RawDepth]]
 
 LUMA = np.array([0.299, 0.587, 0.114], np.float32)  # ITU-R BT.601, as every codec of the recordings uses
 
-MATCHERS: dict[str, Matcher] = {"patchmatch": patchmatch, "colmap": mvs.colmap_patch_match}
+MATCHERS: dict[str, Matcher] = {"patchmatch": patchmatch}
 """Matchers by their name in the settings."""
 
 ON_DISK = ("sensor", "workspace")
 """What the setting `matcher` may name besides: depth beside a recording (`d2_plugin.priors.depth_on_disk`)."""
-
-WHOLE_IMAGES = ("colmap",)
-"""Matchers that match every pixel whatever is wanted: carrying matches over would only make them older."""
 
 
 def geometric_depth(
@@ -80,18 +76,16 @@ def geometric_depth(
 
 
 def choose_matcher(name: str) -> str:
-    """The name of the matcher that `auto` stands for on this machine, or `name` itself if it is known.
+    """The name of the matcher that `auto` stands for, or `name` itself if it is known.
 
     Raises:
         D2Error: an unknown name, or one that stands for depth on disk.
     """
     if name in ON_DISK:
         raise D2Error(f"matcher = {name} reads depth that lies beside a recording: build the priors of that recording")
-    if name != "auto":
-        if name not in MATCHERS:
-            raise unknown_name("stereo matcher", name, [*MATCHERS, *ON_DISK, "auto"])
-        return name
-    return "patchmatch" if mvs.why_not_usable() else "colmap"
+    if name != "auto" and name not in MATCHERS:
+        raise unknown_name("stereo matcher", name, [*MATCHERS, *ON_DISK, "auto"])
+    return "patchmatch" if name == "auto" else name
 
 
 def gray(image: np.ndarray) -> np.ndarray:

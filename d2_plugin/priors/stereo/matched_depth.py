@@ -15,7 +15,7 @@ from d2_plugin.priors.frame import Frame
 from d2_plugin.priors.geometric_source import GeometricSource
 from d2_plugin.priors.stereo.depth_range import DepthBounds
 from d2_plugin.priors.stereo.filtering.filter import GeometricDepth
-from d2_plugin.priors.stereo.geometric_depth import WHOLE_IMAGES, choose_matcher, geometric_depth
+from d2_plugin.priors.stereo.geometric_depth import choose_matcher, geometric_depth
 from d2_plugin.priors.stereo.reuse import MatchMemory
 from d2_plugin.priors.stereo.settings import StereoSettings
 from d2_plugin.recordings.recording import Camera
@@ -42,10 +42,7 @@ class MatchedDepth(GeometricSource):
         frames: Sequence[int],
         read: Callable[[int], Frame],
     ) -> None:
-        matcher = choose_matcher(settings.matcher)
-        if matcher in WHOLE_IMAGES:
-            settings = replace(settings, reuse_static=False)
-        super().__init__(cameras, bounds, settings, matcher, cache / "stereo")
+        super().__init__(cameras, bounds, settings, choose_matcher(settings.matcher), cache / "stereo")
         self.depth_range = bounds[:2]
         self.read = read
         self._before = {after: before for block in frame_blocks(frames, settings) for before, after in pairwise(block)}

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 from d2_plugin.errors import D2Error
 from d2_plugin.settings import Angle, Range, Seed, Settings, Share
 
-MatcherName = Literal["auto", "none", "sensor", "workspace", "colmap", "patchmatch"]
+MatcherName = Literal["auto", "none", "sensor", "workspace", "patchmatch"]
 """What matches views, or what kind of depth on disk is taken in place of matching."""
 
 NO_MATCHER: MatcherName = "none"
@@ -19,7 +19,6 @@ COMMON = ("max_pixels", "between_pixels", "min_sources", "min_angle", "max_angle
 
 DEPENDS_ON: dict[str, tuple[str, ...]] = {
     "patchmatch": (*COMMON, "patchmatch_sources", "seed"),
-    "colmap": (*COMMON, "patchmatch_sources", "colmap_geometric"),
     "workspace": ("between_pixels", "min_sources", "min_angle", "max_angle"),
     "sensor": ("sensor_sigma",),
 }
@@ -33,9 +32,8 @@ class StereoSettings(Settings):
     """Geometric depth (docs/priors.md)."""
 
     matcher: MatcherName = "auto"
-    """Matchers: `patchmatch` (compiled), `colmap` (needs CUDA). Depth that lies on disk: `sensor`, `workspace`
-    (COLMAP's). `none` matches nothing and reads nothing. `auto` takes the first of sensor (of every camera), workspace,
-    colmap and patchmatch that there is."""
+    """`patchmatch` matches. Depth that lies on disk: `sensor`, `workspace` (COLMAP's). `none` matches nothing and reads
+    nothing. `auto` takes the first of sensor (of every camera), workspace and patchmatch that there is."""
     folder: str = ""
     """Where the depth on disk lies, relative to the recording; `{frame}` (as in `mvs/{frame:05d}`) stands for the frame
     number. Where empty: `depth` for `sensor`, `colmap/FRAME`, `colmap` or `dense` for `workspace`."""
@@ -44,11 +42,7 @@ class StereoSettings(Settings):
     patchmatch_device: Literal["auto", "cuda", "cpu"] = "auto"
     """Where patchmatch runs: `auto` takes the GPU where torch sees one. Both return the same depth."""
     patchmatch_sources: Annotated[int, Range(1, 32)] = 4
-    """At most this many other views are matched, by COLMAP too: those that overlap at a good angle."""
-    colmap_geometric: bool = True
-    """Whether COLMAP's second pass runs, which asks the other views' depths; the paper's COLMAP does."""
-    colmap_minutes: Annotated[float, Range(0.01, 100_000, unit="minutes")] = 30.0
-    """COLMAP is ended when it takes longer than this for one timestamp."""
+    """At most this many other views are matched: those that overlap at a good angle."""
     between_pixels: bool = True
     """Read a source's depth between its pixels where they are one surface; off, that of the nearest one."""
     min_sources: Annotated[int, Range(0, 1000)] = 1
