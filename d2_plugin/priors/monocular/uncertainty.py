@@ -106,7 +106,7 @@ def monocular_uncertainty(
     geometric: np.ndarray,
     settings: AlignSettings,
     confidence: np.ndarray | None = None,
-    kind: MonoKind = "relative",
+    kind: MonoKind | None = "relative",
 ) -> Uncertainty:
     """How wrong the corrected map may be, from the anchors that can be left out.
 
@@ -114,9 +114,10 @@ def monocular_uncertainty(
         aligned: aligned monocular depth before local correction [H, W], 0 where it has none.
         geometric: D^g, the anchors [H, W], 0 where there are none.
         settings: of the local correction.
-        confidence: the map's own, 0..1 [H, W]: errors are spread as 1 / confidence besides, and how large they are is
-            measured as ever. None is 1 everywhere.
-        kind: what the map is: its line is one in inverse depth or in depth.
+        confidence: the map's own, in any unit [H, W]: errors are spread as 1 / confidence besides, and how large they
+            are is measured as ever. None is 1 everywhere.
+        kind: what the map is: its line is one in inverse depth or in depth. None is a map known up to a scale, which
+            has no line to draw on.
     """
     small, anchors = _shrunk(aligned), _shrunk(geometric)
     sure = None if confidence is None else _relative(_shrunk(confidence))
@@ -127,7 +128,8 @@ def monocular_uncertainty(
     corrected = corrected_depth(small, anchors, settings)
     usual, without_own = error_shape(corrected, anchors)
     between = HARDER * skill.tail * skill.scale * divided(usual, sure)
-    sigma = _enlarged(np.hypot(between, extrapolation_error(small, anchors, kind, settings)), aligned.shape)
+    beyond = 0.0 if kind is None else extrapolation_error(small, anchors, kind, settings)
+    sigma = _enlarged(np.hypot(between, beyond), aligned.shape)
     left_out = AT_ANCHORS * skill.tail * skill.scale * divided(without_own, sure)
     at_anchors = _enlarged(left_out, aligned.shape)
     usable = (aligned > 0) & (sigma < HOPELESS) & (not skill.nil)
