@@ -27,7 +27,6 @@ from d2_plugin.priors.monocular.align import (
 )
 from d2_plugin.priors.monocular.correct import corrected_depth
 from d2_plugin.priors.monocular.far import CLEARLY, far_pixels
-from d2_plugin.priors.monocular.order import quantile
 from d2_plugin.priors.monocular.uncertainty import Skill, Uncertainty, monocular_uncertainty
 from d2_plugin.priors.multiview.fit import UNSEEN, Vote, fitted, voted
 from d2_plugin.priors.multiview.source import MultiviewMap
@@ -268,7 +267,7 @@ def _aligned(prepared: _Prepared, settings: PriorSettings) -> _AlignedMap:
     if not alignment.accepted:
         return _AlignedMap(nothing, alignment.status.value)
     anchors = geometric[geometric > 0]
-    farthest = quantile(anchors, 0.995) if anchors.size else np.inf
+    farthest = float(np.quantile(anchors, 0.995)) if anchors.size else np.inf
     aligned = aligned_depth(prediction, alignment, FARTHEST * farthest)
     if settings.variant == "dual_unaligned":
         return _AlignedMap(aligned)

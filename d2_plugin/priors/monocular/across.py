@@ -23,7 +23,6 @@ import numpy as np
 
 from d2_plugin.priors.geometry import view_pair
 from d2_plugin.priors.monocular.align import INLIER_ERROR, SEED, Alignment, AlignStatus, predicted
-from d2_plugin.priors.monocular.order import quantile
 from d2_plugin.recordings.recording import Camera, MonoKind
 
 SPAN = 0.15
@@ -104,7 +103,7 @@ def is_open(view: Shown) -> bool:
     anchors = view.mono[known & (view.geometric > 0)]
     if not anchors.size:
         return False
-    first, last = (quantile(anchors, share) for share in MOST)
+    first, last = (float(np.quantile(anchors, share)) for share in MOST)
     if last - first > SPAN * (np.fmax.reduce(view.mono, axis=None) - np.fmin.reduce(view.mono, axis=None)):
         return False  # nearly always, and spares the quantiles of the whole map
     low, high = np.quantile(view.mono[known], RANGE)

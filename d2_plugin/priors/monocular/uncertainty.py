@@ -31,7 +31,6 @@ from d2_plugin.priors.extras import opencv
 from d2_plugin.priors.maps_on_disk import divided
 from d2_plugin.priors.monocular.correct import corrected_depth, corrected_without
 from d2_plugin.priors.monocular.extrapolation import extrapolation_error
-from d2_plugin.priors.monocular.order import median, quantile
 from d2_plugin.priors.settings import AlignSettings
 from d2_plugin.recordings.recording import MonoKind
 
@@ -154,11 +153,11 @@ def measured_skill(
         errors.append(_log_error(depth, anchors, place))
         ratios.append(errors[-1] / divided(shape, None if confidence is None else confidence.ravel()[place]))
     # The map was aligned to all anchors, those left out among them: so the constant is the median of all.
-    constant = np.full(anchors.shape, median(anchors[anchors > 0]), np.float32)
+    constant = np.full(anchors.shape, np.median(anchors[anchors > 0]), np.float32)
     flat = corrected_without(constant, anchors, holes[:COMPARED], settings)
     without = [_log_error(depth, anchors, place) for depth, place in zip(flat, places)]
-    compared, alone = (median(np.concatenate(each)) for each in (errors[:COMPARED], without))
-    all_ratios, error = np.concatenate(ratios), median(np.concatenate(errors))
+    compared, alone = (float(np.median(np.concatenate(each))) for each in (errors[:COMPARED], without))
+    all_ratios, error = np.concatenate(ratios), float(np.median(np.concatenate(errors)))
     scale = _scale(all_ratios, int(np.count_nonzero(anchors)))
     return Skill(scale, error, alone / max(compared, np.finfo(float).tiny), _tail(all_ratios, scale))
 
@@ -191,7 +190,7 @@ def error_shape(depth: np.ndarray, anchors: np.ndarray, at: np.ndarray | None = 
     by_label = np.zeros(int(label.max()) + 1, np.float32)
     by_label[label[known]] = log_anchors
     gap = np.abs(chosen(log_depth) - by_label[chosen(label)])
-    beyond = np.maximum(chosen(log_depth) - np.float32(median(log_anchors)), 0)
+    beyond = np.maximum(chosen(log_depth) - np.median(log_anchors), 0)
     nowhere_above = np.where(predicted, log_depth, np.float32(-EVER))
     nowhere_below = np.where(predicted, log_depth, np.float32(EVER))
 
@@ -223,12 +222,12 @@ def _log_error(depth: np.ndarray, anchors: np.ndarray, place: np.ndarray) -> np.
 
 def _tail(ratios: np.ndarray, scale: float) -> float:
     """How far errors in units of their shape go beyond the usual ones of that scale, 1 at least."""
-    return float(max(quantile(ratios, IN_TAIL) / (USUAL_TAIL * scale), 1))
+    return float(max(np.quantile(ratios, IN_TAIL) / (USUAL_TAIL * scale), 1))
 
 
 def _scale(ratios: np.ndarray, anchors: int) -> float:
     """The 68 % quantile of errors in units of their shape, from few anchors not below what is usual."""
-    measured = quantile(ratios, 0.68)
+    measured = float(np.quantile(ratios, 0.68))
     share = anchors / (anchors + EVIDENCE)
     return float(max(measured, measured**share * USUAL ** (1 - share)))
 

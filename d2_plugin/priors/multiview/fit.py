@@ -19,7 +19,7 @@ from d2_plugin.priors.multiview.source import MultiviewMap, surer_half
 from d2_plugin.priors.settings import AlignSettings, PriorSettings
 from d2_plugin.recordings.recording import Camera
 
-UNSEEN = 0.04
+UNSEEN = 0.03
 """What maps of one network have in common, standard deviation of log depth: it does not show in their differences."""
 WITNESSES = 20
 """So many stereo depths of a view must lie where two maps part, to say which of the two is wrong where they part."""
@@ -49,26 +49,25 @@ def fitted(
         cameras: their calibrations.
         settings: of the multi-view source, and of what makes a fit acceptable.
     """
-    groups = [[name] for name in maps] if settings.multiview_scale == "view" else [list(maps)]
     least, groups = settings.align.min_anchors, [[name] for name in maps]
     logs = {name: _logs(map_, anchors[name]) for name, map_ in maps.items()}
     shifts = dict.fromkeys(maps, 0.0)
     for group in groups if settings.multiview_scale == "view" else [list(maps)]:
-        together = np.concatenate([logs[name][0] for name in group] or [np.zeros(0)])
+        together = np.concatenate([logs[name][0] for name in group])
         if together.size >= least and settings.multiview_scale != "metric":
             shifts |= dict.fromkeys(group, float(np.median(together)))
     scaled = {name: map_._replace(depth=map_.depth * np.float32(np.exp(shifts[name]))) for name, map_ in maps.items()}
-    seen = _Seen.of(scaled, cameras)
-    error = np.concatenate([np.abs(log - shifts[name]) for name, (log, _) in logs.items()] or [np.zeros(0)])
-    sure = np.concatenate([confidence for _, confidence in logs.values()] or [np.zeros(0)])
-    power = power_of(sure, error) if error.size >= least else seen.power
+    seen, power = _seen(scaled, cameras)
+    errors = {name: np.abs(log - shifts[name]) for name, (log, _) in logs.items()}
+    if sum(error.size for error in errors.values()) >= least:
+        sure = np.concatenate([confidence for _, confidence in logs.values()])
+        power = power_of(sure, np.concatenate(list(errors.values())))
     found = {}
     for name, map_ in maps.items():
-        alignment = _judged(np.abs(logs[name][0] - shifts[name]), shifts[name], seen.by[name], settings.align)
-        known = map_.confidence[map_.confidence > 0]
-        unit = float(np.quantile(known, 0.75)) if known.size else 1.0
-        found[name] = Fitted(map_.depth, alignment, (map_.confidence / np.float32(unit)) ** np.float32(power))
-        found[name].sure[map_.confidence == 0] = 0
+        known = map_.confidence > 0
+        unit = np.quantile(map_.confidence[known], 0.75) if known.any() else np.float32(1)
+        sure = np.where(known, (map_.confidence / unit) ** np.float32(power), np.float32(0))
+        found[name] = Fitted(map_.depth, _judged(errors[name], shifts[name], seen.get(name), settings.align), sure)
     return found
 
 
@@ -78,40 +77,29 @@ def _logs(map_: MultiviewMap, anchors: np.ndarray) -> tuple[np.ndarray, np.ndarr
     return np.log(anchors[both] / map_.depth[both]), map_.confidence[both]
 
 
-class _Seen(NamedTuple):
-    """What the views' maps show of each other."""
-
-    by: dict[str, Agreement]
-    """How well the surer half of each fits those of the others."""
-    power: float
-    """Of the confidence by which they part less where they are surer."""
-
-    @classmethod
-    def of(cls, maps: Mapping[str, MultiviewMap], cameras: Mapping[str, Camera]) -> _Seen:
-        surer = {name: surer_half(*map_) for name, map_ in maps.items()}
-        rest = {name: np.where(np.isfinite(surer[name]), np.float32(np.nan), map_.depth) for name, map_ in maps.items()}
-        as_it_is, unknown = np.ones(1), Agreement(0.0, np.inf)
-        better, worse = (shared_scale(part, cameras, as_it_is).agreements for part in (surer, rest))
-        sure, error = [], []
-        for name in better.keys() & worse.keys():
-            for part, agreement in ((surer, better[name]), (rest, worse[name])):
-                known = np.isfinite(part[name]) & (maps[name].confidence > 0)
-                if known.any() and np.isfinite(agreement.spread):
-                    sure.append(float(np.median(maps[name].confidence[known])))
-                    error.append(agreement.spread)
-        by = {name: better.get(name, unknown) for name in maps}
-        return cls(by, power_of(np.array(sure), np.array(error)))
+def _seen(maps: Mapping[str, MultiviewMap], cameras: Mapping[str, Camera]) -> tuple[dict[str, Agreement], float]:
+    """How well the surer half of each map fits those of the others, and the power by which surer halves part less."""
+    surer = {name: surer_half(*map_) for name, map_ in maps.items()}
+    rest = {name: np.where(np.isfinite(surer[name]), np.float32(np.nan), map_.depth) for name, map_ in maps.items()}
+    found = [shared_scale(half, cameras, np.ones(1)).agreements for half in (surer, rest)]
+    if not all(found):
+        return found[0], 0.0
+    spread = [float(np.median([fit.spread for fit in fits.values()])) for fits in found]
+    sure = [
+        float(np.median(np.concatenate([maps[name].confidence[np.isfinite(half[name])] for name in half])))
+        for half in (surer, rest)
+    ]
+    return found[0], power_of(np.array(sure), np.array(spread))
 
 
-def _judged(error: np.ndarray, shift: float, seen: Agreement, settings: AlignSettings) -> Alignment:
+def _judged(error: np.ndarray, shift: float, seen: Agreement | None, settings: AlignSettings) -> Alignment:
     """Whether a view's map may be used: by its anchors, missed by `error` [n], or by what other views show."""
-    enough = error.size >= settings.min_anchors
-    inliers = float((error < INLIER_ERROR).mean()) if enough else seen.matched
-    if enough:
+    agreed = seen is not None and seen.matched >= AGREES
+    status, inliers = AlignStatus.ACROSS if agreed else AlignStatus.PARTED, 0.0
+    if error.size >= settings.min_anchors:
+        inliers = float((error < INLIER_ERROR).mean())
         status = AlignStatus.OK if inliers >= settings.min_inliers else AlignStatus.FEW_INLIERS
-    else:
-        status = AlignStatus.ACROSS if inliers >= AGREES else AlignStatus.UNSTABLE
-    across = seen.spread if seen.matched >= AGREES else np.nan
+    across = seen.spread if seen is not None and agreed else np.nan
     return Alignment(status, "metric", float(np.exp(shift)), 0.0, error.size, inliers=inliers, across=across)
 
 

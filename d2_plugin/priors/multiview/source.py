@@ -14,7 +14,7 @@ from d2_plugin.priors.frame import Frame, digest
 from d2_plugin.priors.maps_on_disk import planar
 from d2_plugin.priors.monocular.network import MonocularModel
 from d2_plugin.priors.multiview.predicted import Predicted, prediction_files, read_prediction, understood
-from d2_plugin.priors.multiview.scale import agree, log_ratio, world_scale
+from d2_plugin.priors.multiview.scale import log_ratio, world_scale
 from d2_plugin.priors.settings import PriorSettings
 from d2_plugin.reading import read_json
 from d2_plugin.recordings.recording import Camera, Recording
@@ -144,9 +144,9 @@ class MultiviewSource:
             there = [frame for frame in self.frames if self.has(frame)]
             first = self._predicted(there[0])
             spread = np.unique(np.linspace(0, len(there) - 1, SCALED_AT).round().astype(int))
-            found = [self._measured(there[place], first) for place in spread]
-            logs = [log for log, agreed in found if agreed] or [log for log, _ in found]
-            self._scale = float(np.median(logs)), first
+            logs = np.array([self._measured(there[place], first) for place in spread])
+            logs = logs[np.isfinite(logs)]
+            self._scale = float(np.median(logs)) if logs.size else 0.0, first
         scale, first = self._scale
         return float(np.exp(scale - self._against(number, first)))
 
@@ -159,14 +159,12 @@ class MultiviewSource:
             )
         return log_ratio(now, first.depth)
 
-    def _measured(self, number: int, first: Predicted) -> tuple[float, bool]:
-        """Log of the scale of the recording from one frame, and whether its maps agree."""
-        prediction, maps = self._predicted(number), {}
-        for place, (name, camera) in enumerate(self.cameras.items()):
-            depth, sure = self._brought(camera, prediction, place)
-            maps[name] = surer_half(depth, sure)
-        shared = world_scale(maps, self.cameras, prediction.poses)
-        return float(np.log(shared.scale)) + self._against(number, first), agree(shared)
+    def _measured(self, number: int, first: Predicted) -> float:
+        """Log of the scale of the recording from one frame; NaN where it does not tell."""
+        prediction = self._predicted(number)
+        brought = {name: self._brought(c, prediction, i) for i, (name, c) in enumerate(self.cameras.items())}
+        maps = {name: surer_half(*map_) for name, map_ in brought.items()}
+        return float(np.log(world_scale(maps, self.cameras, prediction.poses))) + self._against(number, first)
 
     def _predicted(self, number: int) -> Predicted:
         """The prediction of one frame, of the training cameras in their order; the last two are kept."""
