@@ -176,6 +176,7 @@ def _of_several_views(
     """The same views with their multi-view maps in the place of the monocular ones."""
     maps = {name: view.view.multiview for name, view in prepared.items() if view.view.multiview is not None}
     anchors = {name: prepared[name].depth for name in maps}
+    found = fitted(maps, anchors, cameras, settings) if maps else {}
     return {
         name: replace(
             prepared[name],
@@ -185,7 +186,7 @@ def _of_several_views(
             confidence=map_.sure,
             shifted=False,
         )
-        for name, map_ in fitted(maps, anchors, cameras, settings).items()
+        for name, map_ in found.items()
     }
 
 
