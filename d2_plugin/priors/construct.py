@@ -22,11 +22,10 @@ from d2_plugin.priors.monocular.align import (
     align,
     aligned_depth,
     aligned_inverse,
-    inverse_at_least,
     not_aligned,
 )
 from d2_plugin.priors.monocular.correct import corrected_depth
-from d2_plugin.priors.monocular.far import CLEARLY, far_pixels
+from d2_plugin.priors.monocular.far import far_pixels
 from d2_plugin.priors.monocular.uncertainty import Skill, Uncertainty, monocular_uncertainty
 from d2_plugin.priors.multiview.fit import UNSEEN, Vote, fitted, voted
 from d2_plugin.priors.multiview.source import MultiviewMap
@@ -323,7 +322,7 @@ def _within(maps: FusedPrior, recorded: np.ndarray) -> FusedPrior:
 def _with_far(maps: FusedPrior, mono: _AlignedMap, prepared: _Prepared) -> FusedPrior:
     """Far pixels take the farthest geometric depth of the view: what is known of them is that they lie behind it."""
     prediction, alignment = prepared.prediction, prepared.alignment
-    if prediction is None or alignment is None or inverse_at_least(prediction, alignment) * mono.farthest >= CLEARLY:
+    if prediction is None or alignment is None:
         return maps
     far = far_pixels(aligned_inverse(prediction, alignment), prepared.depth, prepared.view.image)
     if not far.any():

@@ -10,6 +10,7 @@ import numpy as np
 
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.depth_on_disk import SensorDepth, find_depth_on_disk
+from d2_plugin.priors.multiview.source import multiview_about
 from d2_plugin.priors.settings import PriorSettings
 from d2_plugin.priors.stereo.settings import NO_MATCHER
 from d2_plugin.recordings import MonoKind, Recording
@@ -118,7 +119,7 @@ def plan_scene(
     settings = settings or PriorSettings()
     kind = settings.mono_kind if settings.mono_onnx else recording.mono_kind
     decisions = (_temporal(recording, cameras), *_geometric(recording, cameras, settings))
-    several = "" if settings.multiview is None else f"depth of all views from {Path(settings.multiview).name}"
+    several = "" if settings.multiview is None else multiview_about(Path(settings.multiview))
     return ScenePlan(decisions, mono_source, kind, several)
 
 

@@ -183,7 +183,9 @@ def test_a_good_source_makes_what_stereo_does_not_know_nearer_to_the_truth_and_d
         assert errors.share < 0.05 or (errors.within > 0.55 and errors.within_two > 0.85), label
 
 
-def test_where_nothing_is_matched_the_views_that_agree_give_a_prior(room: Recording, maps: Path, tmp_path: Path) -> None:
+def test_where_nothing_is_matched_the_views_that_agree_give_a_prior(
+    room: Recording, maps: Path, tmp_path: Path
+) -> None:
     store = build(showing(room, {}, mono_kind=None), tmp_path, ALONE, maps)
     labels = np.stack([store.prior(name, 1).labels.numpy() for name in NAMES])
     assert (labels == Label.AGREED).mean() > 0.05

@@ -167,13 +167,6 @@ def aligned_inverse(mono: np.ndarray, alignment: Alignment) -> np.ndarray:
     return np.where(mono == 0, np.minimum(value, 0), value)
 
 
-def inverse_at_least(mono: np.ndarray, alignment: Alignment) -> float:
-    """What no number of `aligned_inverse` lies below, from the ends of the map [H, W]; NaN where that gives none."""
-    low, high = float(np.fmin.reduce(mono, axis=None)), float(np.fmax.reduce(mono, axis=None))
-    ends = [low, high, 0.0] if low <= 0 <= high else [low, high]
-    return float(np.fmin.reduce(aligned_inverse(np.array(ends), alignment)))
-
-
 def predicted(mono: np.ndarray) -> np.ndarray:
     """Pixels at which the network said something, bool: finite, and not the zero of a saturated ReLU.
 

@@ -6,19 +6,21 @@
 | VGGT (`demo_gradio.py`) | depth [V, h, w, 1] | depth_conf | extrinsic, world to camera | intrinsic | |
 | MapAnything (`gradio_app.py`) | depth [V, h, w, 1] | conf | extrinsic, CAMERA TO WORLD | intrinsic | final_mask |
 
-Depth alone is required. The mask tells MapAnything, whose poses are turned around.
+Depth alone is required. The mask tells MapAnything, whose poses are turned around. Beside the files multiview.json may
+say which cameras the network saw, in its order, and that its maps are emulated: {"cameras": [...], "emulated": true}.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from d2_plugin.arrays import array_names, read_array
 from d2_plugin.errors import D2Error
+from d2_plugin.reading import read_json
 from d2_plugin.recordings.files import FrameFiles, frame_number, numbered_files
 
 NAMES = {
@@ -45,6 +47,12 @@ class Predicted(NamedTuple):
     """World to camera [V, 3, 4], in a world that is the calibration's up to a similarity."""
     intrinsics: np.ndarray | None
     """[V, 3, 3], pixels of these maps."""
+
+
+def declared(folder: Path) -> dict[str, Any]:
+    """What multiview.json beside the files declares: `cameras`, whether maps are `emulated`; nothing without it."""
+    path = folder / "multiview.json"
+    return read_json(path, "list the cameras in the order in which the network saw them") if path.is_file() else {}
 
 
 def prediction_files(folder: Path) -> FrameFiles:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -13,10 +13,9 @@ from d2_plugin.priors.extras import opencv
 from d2_plugin.priors.frame import Frame, digest
 from d2_plugin.priors.maps_on_disk import planar
 from d2_plugin.priors.monocular.network import MonocularModel
-from d2_plugin.priors.multiview.predicted import Predicted, prediction_files, read_prediction, understood
+from d2_plugin.priors.multiview.predicted import Predicted, declared, prediction_files, read_prediction, understood
 from d2_plugin.priors.multiview.scale import log_ratio, world_scale
 from d2_plugin.priors.settings import PriorSettings
-from d2_plugin.reading import read_json
 from d2_plugin.recordings.recording import Camera, Recording
 from d2_plugin.store.files import EntryFolder, hash_of
 from d2_plugin.values import shown
@@ -39,6 +38,12 @@ class MultiviewMap(NamedTuple):
     """Planar, float32 [H, W], NaN where there is none."""
     confidence: np.ndarray
     """float32 [H, W] in a unit of the network's own, 0 where there is no depth."""
+
+
+def multiview_about(path: Path) -> str:
+    """The source as a person reads it."""
+    emulated = path.is_dir() and declared(path).get("emulated") is True
+    return f"depth of all views from {path.name}{' (emulated)' if emulated else ''}"
 
 
 class MultiviewSource:
@@ -65,7 +70,7 @@ class MultiviewSource:
     ) -> None:
         path, self.settings, self.read = Path(settings.multiview or ""), settings, read
         self.cameras = {name: camera for name, camera in recording.cameras.items() if name in names}
-        self.frames, self.model, emulated = recording.frames, None, False
+        self.frames, self.model = recording.frames, None
         self.orders = [list(self.cameras), list(recording.cameras)]
         self._last: dict[int, Predicted] = {}
         self._scale: tuple[float, Predicted] | None = None
@@ -76,24 +81,19 @@ class MultiviewSource:
             self.files, self._fingerprint = {}, self.model.fingerprint()
         else:
             self.files = prediction_files(path)
-            emulated = self._read_about(path / "multiview.json", recording)
+            self._read_order(declared(path).get("cameras"), path, recording)
         self.entries = EntryFolder(cache, synced=False)
-        self.about = f"depth of {len(self.cameras)} views from {path.name}" + (" (emulated)" if emulated else "")
+        self.about = multiview_about(path)
 
-    def _read_about(self, path: Path, recording: Recording) -> bool:
-        """Which cameras the network saw, in its order, and whether its maps are emulated."""
-        if not path.is_file():
-            return False
-        table = read_json(path, "list the cameras in the order in which the network saw them")
-        cameras = table.get("cameras")
-        if cameras is not None:
-            if not isinstance(cameras, list) or not cameras:
-                raise D2Error(f"{path} has cameras {shown(cameras)}, expected a list of names: correct it")
-            for name in (*cameras, *self.cameras):
-                if name not in recording.cameras or name not in cameras:
-                    raise unknown_name(f"camera in {path}", str(name)[:40], recording.cameras)
-            self.orders = [cameras]
-        return table.get("emulated") is True
+    def _read_order(self, cameras: Any, folder: Path, recording: Recording) -> None:
+        if cameras is None:
+            return
+        if not isinstance(cameras, list) or not cameras:
+            raise D2Error(f"{folder}/multiview.json has cameras {shown(cameras)}, expected a list of names: correct it")
+        for name in (*cameras, *self.cameras):
+            if name not in recording.cameras or name not in cameras:
+                raise unknown_name(f"camera in {folder}/multiview.json", str(name)[:40], recording.cameras)
+        self.orders = [cameras]
 
     def has(self, frame: int) -> bool:
         """Whether there is anything of this frame."""
