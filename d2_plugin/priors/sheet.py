@@ -149,8 +149,8 @@ def _caption(store: PriorStore, camera: str, frame: int) -> str:
         for name, share in record["shares"].items()
         if share > 0
     )
-    source = "".join(f"; {about}" for name in ("monocular", "several") if (about := record[name]))
-    alignment = (record["multiview"] or {}).get("alignment", {})
+    source = "".join(f"; {about}" for name in ("monocular", "several") if (about := record.get(name)))
+    alignment = (record.get("multiview") or {}).get("alignment", {})
     if alignment and alignment["status"] not in ("ok", "across"):
         source += f", refused: {alignment['reason']}"
     refused = f"; map refused: {record['refused']}" if record["refused"] else ""
