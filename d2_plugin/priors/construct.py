@@ -76,8 +76,6 @@ class ViewPrior:
     """What the cache of geometric depth recorded."""
     several: dict[str, Any] | None = None
     """Alignment and skill of the multi-view map; None where there is none."""
-    confirmed: np.ndarray | None = None
-    """Where the monocular map confirms it, bool [H, W]."""
 
     def record(self) -> dict[str, Any]:
         """What of it goes into the JSON beside the stored maps."""
@@ -130,14 +128,7 @@ def construct(
     tails = {name: prior.skill.tail for name, prior in priors.items() if prior.skill is not None}
     at_best = AT_BEST if any(view.depth.any() for view in prepared.values()) else UNSEEN
     informed = with_evidence(maps, cameras, settings.agreement, tails, at_best)
-    return {name: replace(prior, maps=_confirmed(informed[name], prior.confirmed)) for name, prior in priors.items()}
-
-
-def _confirmed(maps: FusedPrior, confirmed: np.ndarray | None) -> FusedPrior:
-    """What two networks' maps agree on is agreed where nothing is known of it but that."""
-    if confirmed is None:
-        return maps
-    return replace(maps, labels=np.where(confirmed & (maps.labels == Label.MONO), np.uint8(Label.AGREED), maps.labels))
+    return {name: replace(prior, maps=informed[name]) for name, prior in priors.items()}
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,9 +215,6 @@ class _AlignedMap:
     farthest: float = float("inf")
     """The farthest anchor, but for a half per cent; infinite where there is none."""
 
-    confirmed: np.ndarray | None = None
-    """Where another network's map agrees, bool [H, W]."""
-
     @property
     def skill(self) -> Skill | None:
         """What left-out anchors show of it."""
@@ -238,8 +226,7 @@ def _view_prior(prepared: _Prepared, several: _Prepared | None, settings: PriorS
     view = prepared.view
     mono = _aligned(prepared, settings)
     multi = None if several is None else _aligned(several, settings)
-    network = mono if multi is None else _voted(mono, multi, prepared, settings)
-    maps = _fused(network, prepared, settings)
+    maps = _fused(mono if multi is None else _voted(mono, multi, prepared, settings), prepared, settings)
     if settings.far and settings.variant == "dual" and not mono.refused:
         maps = _with_far(maps, mono, prepared)
     if view.recorded is not None:
@@ -252,8 +239,7 @@ def _view_prior(prepared: _Prepared, several: _Prepared | None, settings: PriorS
         about_several = {"alignment": several.alignment.as_json(), "skill": multi.skill and multi.skill.as_json()}
         refused = mono.refused and multi.refused
     colored = replace(maps, colors=view.image)
-    confirmed = network.confirmed
-    return ViewPrior(colored, refused, prepared.alignment, mono.skill, about_stereo, about_several, confirmed)
+    return ViewPrior(colored, refused, prepared.alignment, mono.skill, about_stereo, about_several)
 
 
 def _voted(mono: _AlignedMap, multi: _AlignedMap, prepared: _Prepared, settings: PriorSettings) -> _AlignedMap:
@@ -265,8 +251,7 @@ def _voted(mono: _AlignedMap, multi: _AlignedMap, prepared: _Prepared, settings:
     skill = min(mono.uncertainty.skill, multi.uncertainty.skill, key=lambda skill: np.nan_to_num(skill.tail, nan=1))
     one, two = (Vote(map_.depth, *map_.uncertainty[:2]) for map_ in (mono, multi) if map_.uncertainty is not None)
     vote = voted(one, two, prepared.depth, settings.conflict_sigmas)
-    uncertainty = Uncertainty(vote.sigma, vote.at_anchors, skill)
-    return replace(mono, depth=vote.depth, uncertainty=uncertainty, confirmed=vote.confirmed)
+    return replace(mono, depth=vote.depth, uncertainty=Uncertainty(vote.sigma, vote.at_anchors, skill))
 
 
 def _aligned(prepared: _Prepared, settings: PriorSettings) -> _AlignedMap:

@@ -111,8 +111,6 @@ class Vote(NamedTuple):
     """Where the map stands alone."""
     at_anchors: np.ndarray
     """What verification compares with."""
-    confirmed: np.ndarray | None = None
-    """Where two maps agree within one sigma, bool; None where there is one alone."""
 
 
 def voted(mono: Vote, multi: Vote, geometric: np.ndarray, conflict_sigmas: float) -> Vote:
@@ -141,8 +139,7 @@ def voted(mono: Vote, multi: Vote, geometric: np.ndarray, conflict_sigmas: float
         parted = [apart / np.hypot(a, b) for a, b in ((mono.sigma, multi.sigma), (mono.at_anchors, multi.at_anchors))]
     close = both & (apart <= conflict_sigmas * spread) & np.isfinite(spread) & ~at_known
     sigmas = []
-    for one, two, ratio in zip(mono[1:3], multi[1:3], parted):
+    for one, two, ratio in zip(mono[1:], multi[1:], parted):
         grown = np.fmin(one, two) * np.fmax(ratio, 1)
         sigmas.append(np.where(both, grown, np.where(first, one, two)).astype(np.float32))
-    sigma, at_anchors = sigmas
-    return Vote(np.where(close, mean, chosen).astype(np.float32), sigma, at_anchors, close & (parted[0] < 1))
+    return Vote(np.where(close, mean, chosen).astype(np.float32), *sigmas)
