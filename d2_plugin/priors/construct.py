@@ -126,7 +126,10 @@ def construct(
         return priors
     maps = {name: prior.maps for name, prior in priors.items()}
     tails = {name: prior.skill.tail for name, prior in priors.items() if prior.skill is not None}
-    at_best = AT_BEST if any(view.depth.any() for view in prepared.values()) else UNSEEN
+    unmeasured = any(
+        prior.several and (prior.several["skill"] or {}).get("scale", 0) is None for prior in priors.values()
+    )
+    at_best = UNSEEN if unmeasured else AT_BEST
     informed = with_evidence(maps, cameras, settings.agreement, tails, at_best)
     return {name: replace(prior, maps=informed[name]) for name, prior in priors.items()}
 

@@ -21,6 +21,8 @@ from d2_plugin.recordings.recording import Camera
 
 UNSEEN = 0.03
 """What maps of one network have in common, standard deviation of log depth: it does not show in their differences."""
+MEASURED = 0.05
+"""Share of the pixels that stereo must know to scale an instant: fewer lie on a thing or two, whose bend is no scale."""
 WITNESSES = 20
 """So many stereo depths of a view must lie where two maps part, to say which of the two is wrong where they part."""
 
@@ -54,7 +56,8 @@ def fitted(
     shifts = dict.fromkeys(maps, 0.0)
     for group in groups if settings.multiview_scale == "view" else [list(maps)]:
         together = np.concatenate([logs[name][0] for name in group])
-        if together.size >= least and settings.multiview_scale != "metric":
+        enough = max(least, MEASURED * sum(anchors[name].size for name in group))
+        if together.size >= enough and settings.multiview_scale != "metric":
             shifts |= dict.fromkeys(group, float(np.median(together)))
     scaled = {name: map_._replace(depth=map_.depth * np.float32(np.exp(shifts[name]))) for name, map_ in maps.items()}
     seen, power = _seen(scaled, cameras)
