@@ -16,9 +16,10 @@ from prior_cases import contents, showing, write_multiview
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.build import PriorSettings, build_priors
 from d2_plugin.priors.declared_error import held_against_truth
-from d2_plugin.priors.multiview.fit import Vote, voted
+from d2_plugin.priors.multiview.fit import Vote, fitted, voted
 from d2_plugin.priors.multiview.predicted import prediction_files, read_prediction, understood
 from d2_plugin.priors.multiview.scale import MOST_POWER, pose_scale, power_of, world_scale
+from d2_plugin.priors.multiview.source import MultiviewMap
 from d2_plugin.priors.settings import StereoSettings
 from d2_plugin.protocol import Label
 from d2_plugin.recordings.cameras.rotations import rotation_of_vector
@@ -252,6 +253,21 @@ def test_one_view_alone_has_no_scale_and_is_refused(room: Recording, tmp_path: P
     summary = build_priors(showing(room, {}, mono_kind=None), NAMES[:1], tmp_path / "prior", settings)
     assert not summary.usable
     assert "surfaces" in summary.reasons()
+
+
+def test_stereo_of_one_thing_does_not_scale_an_instant_and_that_of_the_scene_does(room: Recording) -> None:
+    """Neither view by view nor for all; metric maps stay as they are."""
+    cameras = {name: room.cameras[name] for name in NAMES}
+    truth = {name: room.depth(name, 0) for name in NAMES}
+    maps = {name: MultiviewMap(depth, np.ones_like(depth)) for name, depth in truth.items()}
+    thing = np.zeros_like(truth["train0"], bool)
+    thing[40:55, 40:70] = True
+    for kind in ("shared", "view", "metric"):
+        settings = replace(SETTINGS, multiview_scale=kind)
+        for known, scale in ((thing, 1.0), (~thing, 1.0 if kind == "metric" else 1.1)):
+            anchors = {name: np.where(known, np.float32(1.1) * depth, 0) for name, depth in truth.items()}
+            found = fitted(maps, anchors, cameras, settings)
+            assert [each.alignment.scale for each in found.values()] == pytest.approx([scale] * 3, rel=1e-5)
 
 
 def test_only_what_changed_is_built_again(room: Recording, tmp_path: Path) -> None:

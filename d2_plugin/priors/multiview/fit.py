@@ -22,7 +22,8 @@ from d2_plugin.recordings.recording import Camera
 UNSEEN = 0.03
 """What maps of one network have in common, standard deviation of log depth: it does not show in their differences."""
 MEASURED = 0.05
-"""Share of the pixels that stereo must know to scale an instant: fewer lie on a thing or two, whose bend is no scale."""
+"""Share of the pixels that stereo must know to scale an instant: fewer lie on a thing or two, and the map's bend there
+is not its scale."""
 WITNESSES = 20
 """So many stereo depths of a view must lie where two maps part, to say which of the two is wrong where they part."""
 
