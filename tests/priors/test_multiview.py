@@ -125,6 +125,22 @@ def test_arrays_that_do_not_belong_together_are_one_sentence(arrays: dict, words
     assert words in str(caught.value)
 
 
+def test_files_that_hold_no_prediction_are_one_sentence(tmp_path: Path) -> None:
+    with pytest.raises(D2Error, match="no multi-view maps"):
+        prediction_files(tmp_path / "nowhere")
+    with pytest.raises(D2Error, match="neither"):
+        prediction_files(tmp_path)
+    garbage = tmp_path / "00001.npz"
+    garbage.write_bytes(b"PK garbage")
+    with pytest.raises(D2Error, match="export the prediction again"):
+        read_prediction(garbage, (3,))
+    np.savez(garbage, depth=np.array(["text"]))
+    with pytest.raises(D2Error, match="plain numbers"):
+        read_prediction(garbage, (3,))
+    np.savez(garbage, depth=np.full((3, 4, 5), 1e300), conf=np.full((3, 4, 5), -1.0))
+    assert np.isnan(read_prediction(garbage, (3,)).depth).all()
+
+
 @given(st.integers(0, 2**32 - 1), st.integers(2, 6), st.floats(-6, 6), st.booleans())
 def test_the_scale_of_poses_is_that_of_the_similarity_also_for_two_cameras_and_on_a_line(
     seed: int, count: int, power: float, line: bool

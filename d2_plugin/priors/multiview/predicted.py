@@ -99,8 +99,8 @@ def understood(arrays: Mapping[str, np.ndarray], where: str, views: tuple[int, .
             f"{where} has depth {depth.shape}, expected [V, height, width] of {wanted} views: run the network on "
             "exactly these cameras, or name those it saw in multiview.json"
         )
-    maps = depth.reshape(count, *shape[-2:]).astype(np.float32)
-    with np.errstate(invalid="ignore"):
+    with np.errstate(over="ignore", invalid="ignore"):  # numbers beyond float32 are no depth
+        maps = depth.reshape(count, *shape[-2:]).astype(np.float32)
         known = np.isfinite(maps) & (maps > 0)
     sure = np.ones_like(maps)
     for name in ("mask", "confidence"):
