@@ -58,6 +58,12 @@ def read_array(
             return found
 
 
+def array_names(path: Path | str, remedy: str = RESTORE) -> set[str]:
+    """The names of the arrays in a .npz file."""
+    with opened(path, remedy) as file, parsing(shown_path(path), remedy), zipfile.ZipFile(file) as archive:
+        return {member.removesuffix(".npy") for member in archive.namelist() if member.endswith(".npy")}
+
+
 def _array(file: IO[bytes], size: int, name: str, remedy: str, most: int) -> np.ndarray:
     """The array that begins where `file` stands, whose file has `size` bytes."""
     shape, columns_first, dtype = _header(file, size, name, remedy)

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from d2_plugin.recordings.recording import Recording, Source
+from d2_plugin.recordings.synthetic.multiview import emulated_multiview
 
 Shown = Callable[[str, int], "np.ndarray | None"]
 
@@ -41,3 +42,21 @@ def write_dense_array(path: Path, depth: np.ndarray) -> None:
     """Write a depth map [H, W] as COLMAP would."""
     height, width = depth.shape
     path.write_bytes(f"{width}&{height}&1&".encode() + np.ascontiguousarray(depth, dtype="<f4").tobytes())
+
+
+def write_multiview(
+    recording: Recording,
+    names: list[str],
+    folder: Path,
+    posed: bool = False,
+    turned: Callable[[dict[str, np.ndarray], int], None] | None = None,
+) -> Path:
+    """Emulated multi-view predictions of all frames; `turned` may spoil the arrays of a frame."""
+    folder.mkdir(parents=True)
+    cameras = [recording.cameras[name] for name in names]
+    for frame in recording.frames:
+        arrays = emulated_multiview([recording.depth(name, frame) for name in names], cameras, 100 + frame, posed)
+        if turned is not None:
+            turned(arrays, frame)
+        np.savez(folder / f"{frame:05d}.npz", **arrays)
+    return folder

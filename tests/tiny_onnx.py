@@ -18,16 +18,17 @@ def mean_network(
     dtype: int = FLOAT,
     outputs: int = 1,
     batch: int = 1,
+    named: str = "disparity",
 ) -> Path:
     """A network whose output [N, outputs, H, W] is the mean of its input channels; a size given as text is dynamic."""
     steps = [_node("ReduceMean", ["image"], ["mean"], axes=[1], keepdims=1)]
     if outputs == 1:
-        steps.append(_node("Identity", ["mean"], ["disparity"]))
+        steps.append(_node("Identity", ["mean"], [named]))
     else:
-        steps.append(_node("Concat", ["mean"] * outputs, ["disparity"], axis=1))
+        steps.append(_node("Concat", ["mean"] * outputs, [named], axis=1))
     graph = b"".join(_message(1, step) for step in steps) + _text(2, "mean")
     graph += _message(11, _value("image", dtype, [batch, channels, height, width]))
-    graph += _message(12, _value("disparity", dtype, [batch, outputs, height, width]))
+    graph += _message(12, _value(named, dtype, [batch, outputs, height, width]))
     opset = _text(1, "") + _varint(2, 13)
     path.write_bytes(_varint(1, 8) + _message(7, graph) + _message(8, opset))
     return path

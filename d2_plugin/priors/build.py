@@ -20,6 +20,7 @@ from d2_plugin.priors.frame import Frame, describe_camera, describe_recording, d
 from d2_plugin.priors.geometric_source import GeometricSource
 from d2_plugin.priors.maps_on_disk import OF_DEPTH, OF_MONO, ConfidenceMaps
 from d2_plugin.priors.monocular.maps import MonoSource, mono_source
+from d2_plugin.priors.multiview.source import MultiviewSource
 from d2_plugin.priors.settings import PriorSettings, Variant
 from d2_plugin.priors.stereo.depth_range import DepthBounds, depth_bounds
 from d2_plugin.priors.stereo.filtering import kernel as filtering
@@ -116,6 +117,7 @@ class _Sources:
     settings: PriorSettings
     """The same with the variant that the sources allow."""
     mono: MonoSource | None
+    multiview: MultiviewSource | None
     geometric: GeometricSource | None
     bounds: DepthBounds | None
     """The depths that are searched; None where nothing bounds them."""
@@ -134,13 +136,18 @@ class _Sources:
         cache = PriorStore.place(output, names) / "cache"
         notes: list[str] = []
         geometric, bounds = _geometric_source(recording, names, settings, points, cache, notes)
-        variant = _variant(settings.variant, recording, names, mono, geometric, notes)
+        several = None
+        if settings.multiview is not None and settings.variant == "dual" and settings.uncertainty:
+            read = functools.partial(Frame.read, recording, names)
+            several = MultiviewSource(recording, names, settings, cache / "multiview", read)
+        variant = _variant(settings.variant, recording, names, mono or several, geometric, notes)
         return cls(
             recording=recording,
             cameras={name: recording.cameras[name] for name in names},
             wanted=settings,
             settings=replace(settings, variant=variant),
             mono=mono,
+            multiview=several,
             geometric=geometric,
             bounds=bounds,
             confidence=ConfidenceMaps.beside(recording.path if settings.uncertainty else None, OF_MONO, names),
@@ -155,11 +162,13 @@ class _Sources:
     @property
     def compared(self) -> bool:
         """Whether the prior of one camera depends on those of the others."""
-        return compares_cameras(self.settings, len(self.cameras), self.geometric is not None)
+        measured = self.geometric is not None or self.multiview is not None
+        return compares_cameras(self.settings, len(self.cameras), measured)
 
     def views(self, frame: Frame, names: Sequence[str]) -> dict[str, ViewSources]:
         """Both depths of the views of one frame."""
         depths = {} if self.geometric is None else self.geometric.depths(frame)
+        several = {} if self.multiview is None else self.multiview.views(frame)
         return {
             name: ViewSources(
                 frame.images[name],
@@ -167,6 +176,7 @@ class _Sources:
                 None if self.mono is None else self.mono.map(name, frame),
                 self.confidence.of(self.cameras[name], frame.number),
                 frame.recorded.get(name),
+                several.get(name),
             )
             for name in names
         }
@@ -176,6 +186,7 @@ class _Sources:
         return {
             "variant": self.settings.variant,
             "monocular": None if self.mono is None else self.mono.about,
+            "several": None if self.multiview is None else self.multiview.about,
             "bounds": None if self.bounds is None else list(self.bounds),
             "settings": asdict(self.wanted),
             "camera": describe_camera(self.cameras[name]),
@@ -193,6 +204,7 @@ class _Sources:
             [settings.hanging_limit, settings.far, settings.mono_along],
             asdict(settings.align),
             None if self.geometric is None else self.geometric.key(frame),
+            None if self.multiview is None else self.multiview.key(frame),
             [settings.agreement, *maps.values()] if self.compared else None,
         )
         return {name: hash_of(*common, maps.get(name)) for name in self.cameras}
@@ -231,24 +243,24 @@ def _variant(
     wanted: Variant,
     recording: Recording,
     names: list[str],
-    mono: MonoSource | None,
+    network: MonoSource | MultiviewSource | None,
     geometric: GeometricSource | None,
     notes: list[str],
 ) -> Variant:
     """The variant that the sources at hand allow; what is left out is noted."""
-    if geometric is not None and mono is not None:
+    if geometric is not None and network is not None:
         return wanted
     if geometric is not None:
         if wanted != "mvs":
             notes.append("no monocular depth: geometric depth counts as verified without a second source")
         return "mvs"
     lacking = "one camera" if len(names) == 1 else "nothing matched"
-    if mono is None:
+    if network is None:
         raise D2Error(
-            f"{recording.name} has no depth source ({lacking}): give a metric monocular network, or cameras that see "
-            "the same"
+            f"{recording.name} has no depth source ({lacking}): give a metric monocular network, a multi-view one, or "
+            "cameras that see the same"
         )
-    notes.append(f"{lacking}: no geometric depth, so nothing is verified and nothing can prune or supervise")
+    notes.append(f"{lacking}: no geometric depth, so nothing is verified but what several views agree on")
     return wanted
 
 

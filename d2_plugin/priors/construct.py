@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from d2_plugin.priors.evidence import with_evidence
+from d2_plugin.priors.evidence import AT_BEST, with_evidence
 from d2_plugin.priors.fuse import FusedPrior, empty_prior, fuse, hanging_pixels
-from d2_plugin.priors.maps_on_disk import planar
+from d2_plugin.priors.maps_on_disk import divided, planar
 from d2_plugin.priors.monocular.across import Shown, aligned_across
 from d2_plugin.priors.monocular.align import (
     Alignment,
@@ -22,19 +22,19 @@ from d2_plugin.priors.monocular.align import (
     align,
     aligned_depth,
     aligned_inverse,
-    inverse_at_least,
     not_aligned,
 )
 from d2_plugin.priors.monocular.correct import corrected_depth
-from d2_plugin.priors.monocular.far import CLEARLY, far_pixels
-from d2_plugin.priors.monocular.order import quantile
+from d2_plugin.priors.monocular.far import far_pixels
 from d2_plugin.priors.monocular.uncertainty import Skill, Uncertainty, monocular_uncertainty
+from d2_plugin.priors.multiview.fit import UNSEEN, Vote, fitted, voted
+from d2_plugin.priors.multiview.source import MultiviewMap
 from d2_plugin.priors.settings import PriorSettings
 from d2_plugin.priors.stereo.filtering.filter import GeometricDepth
 from d2_plugin.protocol import Label
 from d2_plugin.recordings.recording import Camera, MonoKind
 
-CONSTRUCTION_VERSION = 14  # raise it when alignment or fusion change what they return
+CONSTRUCTION_VERSION = 15  # raise it when alignment or fusion change what they return
 
 FARTHEST = 3.0
 """Aligned monocular depth beyond this multiple of the 99.5 percentile of the anchors is left empty."""
@@ -58,6 +58,8 @@ class ViewSources:
     """That of the monocular map, 0..1 [H, W]; None is 1 everywhere."""
     recorded: np.ndarray | None = None
     """Which pixels were recorded, bool [H, W]; None is all."""
+    multiview: MultiviewMap | None = None
+    """Of a multi-view network; None where it says nothing of this view."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,6 +74,8 @@ class ViewPrior:
     """What left-out anchors show of the monocular map; None where they were not left out."""
     stereo: dict[str, Any] | None
     """What the cache of geometric depth recorded."""
+    several: dict[str, Any] | None = None
+    """Alignment and skill of the multi-view map; None where there is none."""
 
     def record(self) -> dict[str, Any]:
         """What of it goes into the JSON beside the stored maps."""
@@ -79,15 +83,16 @@ class ViewPrior:
             "refused": self.refused,
             "alignment": None if self.alignment is None else self.alignment.as_json(),
             "skill": None if self.skill is None else self.skill.as_json(),
+            "multiview": self.several,
             "stereo": self.stereo,
             "shares": self.maps.shares(),
             "sigmas": self.maps.sigmas(),
         }
 
 
-def compares_cameras(settings: PriorSettings, cameras: int, geometric: bool) -> bool:
-    """Whether the prior of one camera depends on those of the others."""
-    return settings.agreement > 0 and settings.variant == "dual" and geometric and cameras > 1
+def compares_cameras(settings: PriorSettings, cameras: int, measured: bool) -> bool:
+    """Whether the prior of one camera depends on those of the others; `measured` by stereo or from several views."""
+    return settings.agreement > 0 and settings.variant == "dual" and measured and cameras > 1
 
 
 def construct(
@@ -105,7 +110,8 @@ def construct(
         kind: what the monocular maps are; None where the recording has none.
     """
     prepared = {name: _Prepared.of(view, cameras[name], settings, kind) for name, view in views.items()}
-    compared = compares_cameras(settings, len(cameras), any(view.geometric is not None for view in views.values()))
+    measured = any(view.geometric is not None or view.multiview is not None for view in views.values())
+    compared = compares_cameras(settings, len(cameras), measured)
     if compared and settings.align.across and kind is not None:
         shown = {
             name: Shown(cameras[name], view.prediction, view.depth, view.alignment)
@@ -114,12 +120,17 @@ def construct(
         }
         for name, alignment in aligned_across(shown, kind).items():
             prepared[name] = replace(prepared[name], alignment=alignment)
-    priors = {name: _view_prior(view, settings, kind) for name, view in prepared.items()}
+    several = _of_several_views(prepared, cameras, settings)
+    priors = {name: _view_prior(view, several.get(name), settings) for name, view in prepared.items()}
     if not compared:
         return priors
     maps = {name: prior.maps for name, prior in priors.items()}
     tails = {name: prior.skill.tail for name, prior in priors.items() if prior.skill is not None}
-    informed = with_evidence(maps, cameras, settings.agreement, tails)
+    unmeasured = any(
+        prior.several and (prior.several["skill"] or {}).get("scale", 0) is None for prior in priors.values()
+    )
+    at_best = UNSEEN if unmeasured else AT_BEST
+    informed = with_evidence(maps, cameras, settings.agreement, tails, at_best)
     return {name: replace(prior, maps=informed[name]) for name, prior in priors.items()}
 
 
@@ -136,6 +147,12 @@ class _Prepared:
     """The monocular map, planar, and NaN where its confidence is 0."""
     alignment: Alignment | None
     """Of that map; None where there is no map, or its scale cannot be known."""
+    kind: MonoKind | None
+    """What the map is; None where the recording has none."""
+    confidence: np.ndarray | None
+    """Of the map, in any unit; None is the same everywhere."""
+    shifted: bool = True
+    """Whether the map is known up to a scale and a shift, and not up to a scale alone."""
 
     @classmethod
     def of(cls, view: ViewSources, camera: Camera, settings: PriorSettings, kind: MonoKind | None) -> _Prepared:
@@ -151,9 +168,28 @@ class _Prepared:
             prediction = planar(prediction, camera)
         if prediction is not None and view.confidence is not None:
             prediction = np.where(view.confidence > 0, prediction, np.float32(np.nan))
-        return cls(
-            view, depth, sigma, prediction, _alignment(prediction, depth, view.geometric is None, settings, kind)
+        alignment = _alignment(prediction, depth, view.geometric is None, settings, kind)
+        return cls(view, depth, sigma, prediction, alignment, kind, view.confidence)
+
+
+def _of_several_views(
+    prepared: Mapping[str, _Prepared], cameras: Mapping[str, Camera], settings: PriorSettings
+) -> dict[str, _Prepared]:
+    """The same views with their multi-view maps in the place of the monocular ones."""
+    maps = {name: view.view.multiview for name, view in prepared.items() if view.view.multiview is not None}
+    anchors = {name: prepared[name].depth for name in maps}
+    found = fitted(maps, anchors, cameras, settings) if maps else {}
+    return {
+        name: replace(
+            prepared[name],
+            prediction=map_.depth,
+            alignment=map_.alignment,
+            kind="metric",
+            confidence=map_.sure,
+            shifted=False,
         )
+        for name, map_ in found.items()
+    }
 
 
 def _alignment(
@@ -182,27 +218,50 @@ class _AlignedMap:
     farthest: float = float("inf")
     """The farthest anchor, but for a half per cent; infinite where there is none."""
 
+    @property
+    def skill(self) -> Skill | None:
+        """What left-out anchors show of it."""
+        return None if self.uncertainty is None else self.uncertainty.skill
 
-def _view_prior(prepared: _Prepared, settings: PriorSettings, kind: MonoKind | None) -> ViewPrior:
-    """D* of one camera, before it is compared with the others."""
+
+def _view_prior(prepared: _Prepared, several: _Prepared | None, settings: PriorSettings) -> ViewPrior:
+    """D* of one camera, before it is compared with the others; `several` holds its multi-view map."""
     view = prepared.view
-    mono = _aligned(prepared, settings, kind)
-    maps = _fused(mono, prepared, settings)
+    mono = _aligned(prepared, settings)
+    multi = None if several is None else _aligned(several, settings)
+    maps = _fused(mono if multi is None else _voted(mono, multi, prepared, settings), prepared, settings)
     if settings.far and settings.variant == "dual" and not mono.refused:
         maps = _with_far(maps, mono, prepared)
     if view.recorded is not None:
         maps = _within(maps, view.recorded)
     stored = {} if view.geometric is None else view.geometric.record
     about_stereo = {key: value for key, value in stored.items() if key != "checksum"} or None
-    skill = None if mono.uncertainty is None else mono.uncertainty.skill
-    return ViewPrior(replace(maps, colors=view.image), mono.refused, prepared.alignment, skill, about_stereo)
+    about_several = None
+    refused = mono.refused
+    if several is not None and multi is not None and several.alignment is not None:
+        about_several = {"alignment": several.alignment.as_json(), "skill": multi.skill and multi.skill.as_json()}
+        refused = mono.refused and multi.refused
+    colored = replace(maps, colors=view.image)
+    return ViewPrior(colored, refused, prepared.alignment, mono.skill, about_stereo, about_several)
 
 
-def _aligned(prepared: _Prepared, settings: PriorSettings, kind: MonoKind | None) -> _AlignedMap:
-    """The monocular map in world units, where there is one and its scale can be known."""
+def _voted(mono: _AlignedMap, multi: _AlignedMap, prepared: _Prepared, settings: PriorSettings) -> _AlignedMap:
+    """Both maps of a view as one, as far as they are accepted."""
+    if multi.refused or multi.uncertainty is None:
+        return mono
+    if mono.refused or mono.uncertainty is None:
+        return multi
+    skill = min(mono.uncertainty.skill, multi.uncertainty.skill, key=lambda skill: np.nan_to_num(skill.tail, nan=1))
+    one, two = (Vote(map_.depth, *map_.uncertainty[:2]) for map_ in (mono, multi) if map_.uncertainty is not None)
+    vote = voted(one, two, prepared.depth, settings.conflict_sigmas)
+    return replace(mono, depth=vote.depth, uncertainty=Uncertainty(vote.sigma, vote.at_anchors, skill))
+
+
+def _aligned(prepared: _Prepared, settings: PriorSettings) -> _AlignedMap:
+    """A network's map in world units, where there is one and its scale can be known."""
     geometric, prediction, alignment = prepared.depth, prepared.prediction, prepared.alignment
     nothing = np.zeros_like(geometric)
-    if kind is None:
+    if prepared.kind is None:
         return _AlignedMap(nothing, "" if geometric.any() else NO_GEOMETRY)
     if prediction is None:
         return _AlignedMap(nothing, NO_MAP)
@@ -211,15 +270,18 @@ def _aligned(prepared: _Prepared, settings: PriorSettings, kind: MonoKind | None
     if not alignment.accepted:
         return _AlignedMap(nothing, alignment.status.value)
     anchors = geometric[geometric > 0]
-    farthest = quantile(anchors, 0.995) if anchors.size else np.inf
+    farthest = float(np.quantile(anchors, 0.995)) if anchors.size else np.inf
     aligned = aligned_depth(prediction, alignment, FARTHEST * farthest)
     if settings.variant == "dual_unaligned":
         return _AlignedMap(aligned)
     depth, uncertainty = corrected_depth(aligned, geometric, settings.align), None
-    if settings.uncertainty and anchors.size > 0:
-        uncertainty = monocular_uncertainty(aligned, geometric, settings.align, prepared.view.confidence, kind)
+    if settings.uncertainty and (anchors.size > 0 or alignment.status is AlignStatus.ACROSS):
+        kind = prepared.kind if prepared.shifted else None
+        uncertainty = monocular_uncertainty(aligned, geometric, settings.align, prepared.confidence, kind)
         if alignment.status is AlignStatus.ACROSS or np.isnan(uncertainty.skill.scale):
             shared = np.where(depth > 0, np.float32(alignment.across), np.float32(np.inf))
+            if not prepared.shifted:
+                shared = np.hypot(divided(shared, prepared.confidence), np.float32(UNSEEN))
             uncertainty = uncertainty._replace(sigma=np.fmin(uncertainty.sigma, shared))
     return _AlignedMap(depth, "", uncertainty, farthest)
 
@@ -263,7 +325,7 @@ def _within(maps: FusedPrior, recorded: np.ndarray) -> FusedPrior:
 def _with_far(maps: FusedPrior, mono: _AlignedMap, prepared: _Prepared) -> FusedPrior:
     """Far pixels take the farthest geometric depth of the view: what is known of them is that they lie behind it."""
     prediction, alignment = prepared.prediction, prepared.alignment
-    if prediction is None or alignment is None or inverse_at_least(prediction, alignment) * mono.farthest >= CLEARLY:
+    if prediction is None or alignment is None:
         return maps
     far = far_pixels(aligned_inverse(prediction, alignment), prepared.depth, prepared.view.image)
     if not far.any():

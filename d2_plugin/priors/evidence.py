@@ -37,6 +37,7 @@ def with_evidence(
     cameras: Mapping[str, Camera],
     tolerance: float,
     tails: Mapping[str, float] | None = None,
+    at_best: float = AT_BEST,
 ) -> dict[str, FusedPrior]:
     """The priors of one instant, each mono-only pixel compared with the other cameras.
 
@@ -44,11 +45,12 @@ def with_evidence(
         priors: D* of synchronized views, by camera.
         cameras: their calibrations.
         tolerance: largest relative difference at which two monocular depths agree.
+        at_best: what agreement of two maps cannot go below, in quadrature.
         tails: by camera, how many times sigma is enlarged for a heavy tail (`Skill.tail`); 1 where that is unknown.
     """
     views = {name: view_of(prior) for name, prior in priors.items()}
     factors = {name: AGREED / np.fmax((tails or {}).get(name, 1.0), 1.0) for name in priors}
-    changed = compare_views(views, cameras, factors, {"tolerance": tolerance, "at_best": AT_BEST, "alone": ALONE})
+    changed = compare_views(views, cameras, factors, {"tolerance": tolerance, "at_best": at_best, "alone": ALONE})
     return {
         name: replace(prior, labels=changed[name][0], depth=changed[name][1], sigma=changed[name][2])
         for name, prior in priors.items()

@@ -33,6 +33,10 @@ Along = Literal["z", "ray"]
 """What a stored depth is measured along."""
 
 
+MultiviewScale = Literal["shared", "view", "metric"]
+"""What the depth of a multi-view network is known up to."""
+
+
 @dataclass(frozen=True)
 class PriorSettings(Settings):
     """Everything that decides what D* of a recording is."""
@@ -73,6 +77,13 @@ class PriorSettings(Settings):
     """Of the network's input: `depth_anything_v2`, `unit`, or `auto`."""
     mono_threads: Annotated[int, Range(0, 1024, unit="threads")] = 1
     """Threads of one inference; 0 leaves the number to onnxruntime."""
+    multiview: str | None = None
+    """Depth of all views from one network: a folder with FRAME.npz as Depth Anything 3, VGGT and MapAnything write
+    them, or an ONNX file for this number of views. Takes part in `dual` with `uncertainty`."""
+    multiview_scale: MultiviewScale = "shared"
+    """Its depth is in the calibration's unit (`metric`), up to one factor an instant (`shared`), or one a `view`."""
+    multiview_along: Along = "z"
+    """What it measures: planar depth `z`, or the distance from the camera along the `ray`."""
     stereo: StereoSettings = field(default_factory=StereoSettings)
     """Geometric depth."""
     align: AlignSettings = field(default_factory=AlignSettings)

@@ -149,7 +149,10 @@ def _caption(store: PriorStore, camera: str, frame: int) -> str:
         for name, share in record["shares"].items()
         if share > 0
     )
-    source = f"; {record['monocular']}" if record["monocular"] else ""
+    source = "".join(f"; {about}" for name in ("monocular", "several") if (about := record.get(name)))
+    alignment = (record.get("multiview") or {}).get("alignment", {})
+    if alignment and alignment["status"] not in ("ok", "across"):
+        source += f", refused: {alignment['reason']}"
     refused = f"; map refused: {record['refused']}" if record["refused"] else ""
     return f"camera {camera}, frame {frame}: {shares}{refused or source}"
 

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.depth_on_disk import SensorDepth, find_depth_on_disk
+from d2_plugin.priors.multiview.source import multiview_about
 from d2_plugin.priors.settings import PriorSettings
 from d2_plugin.priors.stereo.settings import NO_MATCHER
 from d2_plugin.recordings import MonoKind, Recording
@@ -53,6 +55,8 @@ class ScenePlan:
     mono_source: str | None = None
     """Where monocular depth comes from, or None where there is none."""
     mono_kind: MonoKind | None = None
+    multiview: str = ""
+    """Where depth of all views from one network comes from; empty where there is none."""
 
     @property
     def decisions(self) -> tuple[Decision, ...]:
@@ -91,13 +95,14 @@ class ScenePlan:
             return settings
         return replace(settings, stereo=replace(settings.stereo, matcher=NO_MATCHER))
 
-    def _following(self) -> tuple[Decision, Decision]:
+    def _following(self) -> tuple[Decision, ...]:
         mono = Decision("monocular", self.mono_source is not None, self.mono_source or "no maps on disk and no network")
         if mono.use and self.mono_kind == "relative" and not self.geometric:
             mono = replace(mono, use=False, reason=f"{mono.reason}: no geometric depth gives their scale")
-        both = self.geometric and mono.use
-        reason = "two depth sources check each other" if both else "there is one depth source at most"
-        return mono, Decision("verification", both, reason)
+        several = (Decision("multiview", True, self.multiview),) if self.multiview else ()
+        count = [self.geometric, mono.use, bool(several)].count(True)
+        reason = "depth sources check each other" if count > 1 else "there is one depth source at most"
+        return mono, *several, Decision("verification", self.geometric and count > 1, reason)
 
 
 def plan_scene(
@@ -114,7 +119,8 @@ def plan_scene(
     settings = settings or PriorSettings()
     kind = settings.mono_kind if settings.mono_onnx else recording.mono_kind
     decisions = (_temporal(recording, cameras), *_geometric(recording, cameras, settings))
-    return ScenePlan(decisions, mono_source, kind)
+    several = "" if settings.multiview is None else multiview_about(Path(settings.multiview))
+    return ScenePlan(decisions, mono_source, kind, several)
 
 
 def _temporal(recording: Recording, cameras: Sequence[str]) -> Decision:

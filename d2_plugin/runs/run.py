@@ -327,7 +327,7 @@ def _about(run: Run, trainer: Any) -> dict[str, Any]:
         "trials": None if run.trials is None else run.trials.as_dict(),
         "plan": scene.plan.as_dict(),
         "recording": scene.recording.name,
-        "mono_emulated": scene.recording.mono_emulated,
+        "mono_emulated": scene.recording.mono_emulated or "(emulated)" in scene.plan.multiview,
         "notes": list(scene.recording.notes),
         "made": circumstances(),
     }

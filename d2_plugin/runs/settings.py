@@ -77,6 +77,8 @@ class RunSettings(Settings):
     """ONNX model of monocular depth."""
     mono_kind: Literal["relative", "metric"] | None = None
     """What the model returns: relative (inverse depth up to scale and shift) or metric (depth)."""
+    multiview: str | None = None
+    """Depth of all views from one network: a folder with FRAME.npz, or an ONNX file."""
     priors: str | None = None
     """Folder of a finished depth prior; without it the run builds its own."""
     priors_in_step: bool = False
@@ -114,7 +116,7 @@ def check(settings: RunSettings) -> RunSettings:
         raise D2Error("--mono-onnx needs --mono-kind relative (inverse depth) or metric (depth): the file names none")
     _check_device(settings.device)
     _check_overrides(settings)
-    paths = ("recording", "mono_onnx", "priors")
+    paths = ("recording", "mono_onnx", "multiview", "priors")
     absolute = {name: _absolute(path, name) for name in paths if (path := getattr(settings, name)) is not None}
     return replace(settings, **absolute)  # type: ignore[arg-type]  # a run is found again from any folder
 
@@ -154,7 +156,7 @@ def _check_overrides(settings: RunSettings) -> None:
 
 def prior_settings(settings: RunSettings) -> PriorSettings:
     """Settings of the prior builder: defaults, the monocular source of the run, the user's table over them."""
-    source = {"mono_onnx": settings.mono_onnx, "mono_kind": settings.mono_kind}
+    source = {name: getattr(settings, name) for name in ("mono_onnx", "mono_kind", "multiview")}
     return PriorSettings.from_dict(_over(source, settings.overrides.get("priors", {}), "priors"))
 
 

@@ -12,8 +12,6 @@ from d2_plugin.priors.monocular.align import (
     AlignStatus,
     align,
     aligned_depth,
-    aligned_inverse,
-    inverse_at_least,
     not_aligned,
     rank_correlation,
     unjudged_line,
@@ -128,14 +126,3 @@ def test_the_unjudged_line_is_that_of_the_alignment(anchors: int, kind: str, dep
     alignment = align(*views, kind=kind, settings=AlignSettings())
     line = unjudged_line(*views, kind=kind, settings=AlignSettings())
     np.testing.assert_equal(line, (alignment.scale, alignment.shift))
-
-
-@pytest.mark.parametrize("kind", ["relative", "metric"])
-@pytest.mark.parametrize("seed", range(20))
-def test_no_aligned_inverse_lies_below_the_bound_that_spares_the_map(kind: str, seed: int) -> None:
-    random = np.random.default_rng(seed)
-    mono = random.normal(random.normal(), 1, (9, 9)).astype(np.float32) * (random.random((9, 9)) < random.random() * 2)
-    mono[0, :2] = np.nan, np.inf
-    alignment = Alignment(AlignStatus.OK, kind, scale=random.uniform(0.1, 2), shift=random.normal())
-    bound, inverse = inverse_at_least(mono, alignment), aligned_inverse(mono, alignment)
-    assert np.isnan(bound) or not (inverse < bound - 1e-12 * abs(bound)).any()

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from d2_plugin.runs.plan import ScenePlan
     from d2_plugin.runs.settings import RunSettings
 
-RECORDING = ("recording", "train_cameras", "frames", "downscale", "mono_onnx", "mono_kind")
+RECORDING = ("recording", "train_cameras", "frames", "downscale", "mono_onnx", "mono_kind", "multiview")
 """Settings of a run that say what is trained on."""
 
 WRITTEN = {

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import combinations, permutations
 from statistics import NormalDist
 from typing import NamedTuple
 
@@ -23,7 +23,6 @@ import numpy as np
 
 from d2_plugin.priors.geometry import view_pair
 from d2_plugin.priors.monocular.align import INLIER_ERROR, SEED, Alignment, AlignStatus, predicted
-from d2_plugin.priors.monocular.order import quantile
 from d2_plugin.recordings.recording import Camera, MonoKind
 
 SPAN = 0.15
@@ -104,11 +103,61 @@ def is_open(view: Shown) -> bool:
     anchors = view.mono[known & (view.geometric > 0)]
     if not anchors.size:
         return False
-    first, last = (quantile(anchors, share) for share in MOST)
+    first, last = (float(np.quantile(anchors, share)) for share in MOST)
     if last - first > SPAN * (np.fmax.reduce(view.mono, axis=None) - np.fmin.reduce(view.mono, axis=None)):
         return False  # nearly always, and spares the quantiles of the whole map
     low, high = np.quantile(view.mono[known], RANGE)
     return bool(last - first < SPAN * (high - low))
+
+
+def shared_scale(maps: Mapping[str, np.ndarray], cameras: Mapping[str, Camera], tried: np.ndarray) -> Shared:
+    """The one factor of all depth maps with which they fit each other best where they overlap.
+
+    What counts is the mean over what other cameras see. The sum would prefer small factors, with which more is seen: a
+    ground below cameras of one height is the same plane with any factor.
+
+    Args:
+        maps: planar depth [H, W] by camera, up to the factor; NaN or 0 where there is none.
+        cameras: their calibrations.
+        tried: factors, ascending; more are tried between the best and its neighbours.
+    """
+    nothing = Alignment(AlignStatus.NOT_ALIGNED, "metric")
+    shown = {
+        name: _Map.of(Shown(cameras[name], depth, np.zeros_like(depth), nothing), "metric")
+        for name, depth in maps.items()
+        if predicted(depth).any()
+    }
+
+    def matched(factor: float) -> float:
+        line = _Line(factor, 0.0)
+        apart = [_apart(one, two, line, [line])[0] for one, two in permutations(shown.values(), 2)]
+        enough = sum(part.size for part in apart) >= SEEN * SAMPLES
+        return float(_match(np.concatenate(apart)).mean()) if enough else 0.0
+
+    factor = 1.0
+    for _ in range(2 if len(shown) > 1 else 0):
+        best = int(np.argmax([matched(factor) for factor in tried]))
+        around = tried[max(best - 1, 0)], tried[min(best + 1, len(tried) - 1)]
+        factor, tried = float(tried[best]), np.geomspace(*around, 2 * FINER + 1)
+    lines = dict.fromkeys(shown, _Line(factor, 0.0))
+    return Shared(factor, {name: _agreement(name, shown, lines) for name in shown} if len(shown) > 1 else {})
+
+
+class Agreement(NamedTuple):
+    """How well a map fits the others where they overlap."""
+
+    matched: float
+    """Mean of exp(-r^2 / 2 s^2); 0 where they see too little of each other."""
+    spread: float
+    """Standard deviation of either map: the median of |r|, to which both add, over that of a normal error."""
+
+
+class Shared(NamedTuple):
+    """One scale of several maps."""
+
+    scale: float
+    agreements: dict[str, Agreement]
+    """How well each map then fits the others."""
 
 
 class _Line(NamedTuple):
@@ -136,7 +185,7 @@ class _Map:
     known: _Line
 
     @classmethod
-    def of(cls, view: Shown, kind: MonoKind, unknown: bool) -> _Map:
+    def of(cls, view: Shown, kind: MonoKind, unknown: bool = False) -> _Map:
         known, inverse = predicted(view.mono), kind == "relative"
         anchors = known & (view.geometric > 0)
         target = view.geometric[anchors].astype(np.float64)
@@ -207,16 +256,7 @@ def _scores(name: str, slopes: np.ndarray, maps: Mapping[str, _Map], lines: Mapp
     return total
 
 
-class _Agreement(NamedTuple):
-    """How well a map fits the others where they overlap."""
-
-    matched: float
-    """Mean of exp(-r^2 / 2 s^2); 0 where they see too little of each other."""
-    spread: float
-    """Standard deviation of either map: the median of |r|, to which both add, over that of a normal error."""
-
-
-def _agreement(name: str, maps: Mapping[str, _Map], lines: Mapping[str, _Line]) -> _Agreement:
+def _agreement(name: str, maps: Mapping[str, _Map], lines: Mapping[str, _Line]) -> Agreement:
     apart = np.concatenate(
         [
             _apart(maps[one], maps[two], lines[one], [lines[two]])[0]
@@ -226,9 +266,9 @@ def _agreement(name: str, maps: Mapping[str, _Map], lines: Mapping[str, _Line]) 
         ]
     )
     if len(apart) < SEEN * SAMPLES:
-        return _Agreement(0.0, np.inf)
+        return Agreement(0.0, np.inf)
     spread = float(np.median(np.nan_to_num(np.abs(apart), nan=np.inf))) / NormalDist().inv_cdf(0.75) / np.sqrt(2)
-    return _Agreement(float(_match(apart).mean()), spread)
+    return Agreement(float(_match(apart).mean()), spread)
 
 
 def _matches(ours: _Map, theirs: _Map, our_lines: Sequence[_Line], their_lines: Sequence[_Line]) -> np.ndarray:

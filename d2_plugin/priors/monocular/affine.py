@@ -22,8 +22,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from d2_plugin.priors.monocular.order import median
-
 BLENDS = (0.0, 0.01, 0.1, 0.5, 1.0)
 """Shares of IRLS curvature tried in turn; at 1 the model majorises F, so a step of it always descends."""
 
@@ -79,7 +77,7 @@ def fit_affine(
     if x.size == 0:
         return AffineFit(np.nan, np.nan, np.nan, np.nan, 0, 0, boundary=False, flat=True, scale_error=np.nan)
     # Centre and spread: in these units an offset of 1e8 or a scale of 1e-3..1e6 changes nothing.
-    weight, x_centre, y_centre = median(weights), median(x), median(y)
+    weight, x_centre, y_centre = float(np.median(weights)), float(np.median(x)), float(np.median(y))
     weights, tiny = weights / weight, np.finfo(float).tiny
     x_spread = max(float(np.abs(x - x_centre).mean()), tiny)
     y_spread = max(float(np.abs(y - y_centre).mean()), epsilon / weight, tiny)
@@ -194,7 +192,7 @@ class _Problem:
         return dot(self.p, self.p), dot(self.p, self.q), dot(self.q, self.q)
 
     def median_shift(self) -> float:
-        return median(self.t / self.q)
+        return float(np.median(self.t / self.q))
 
     def solve(self, tolerance: float, max_iterations: int) -> _State:
         """Newton with IRLS blending from a few IRLS steps; the gap uses the best bound over all iterates."""

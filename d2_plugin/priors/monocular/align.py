@@ -14,7 +14,6 @@ import numpy as np
 
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.priors.monocular.affine import AffineFit, fit_affine
-from d2_plugin.priors.monocular.order import median, quantile
 from d2_plugin.priors.monocular.settings import AlignSettings
 from d2_plugin.recordings.recording import MonoKind
 
@@ -52,6 +51,7 @@ class AlignStatus(StrEnum):
     BOUNDARY = "no positive scale fits: monocular and geometric depth do not rise together"
     UNSTABLE = "the scale is not significant: monocular and geometric depth are nearly unrelated"
     FEW_INLIERS = "too few geometric depths agree with the aligned monocular map"
+    PARTED = "the maps of one network do not show the same surfaces from camera to camera"
     NOT_CERTIFIED = "the fit stopped before its optimality could be certified"
     NOT_ALIGNED = "used as it is, without alignment"
 
@@ -167,13 +167,6 @@ def aligned_inverse(mono: np.ndarray, alignment: Alignment) -> np.ndarray:
     return np.where(mono == 0, np.minimum(value, 0), value)
 
 
-def inverse_at_least(mono: np.ndarray, alignment: Alignment) -> float:
-    """What no number of `aligned_inverse` lies below, from the ends of the map [H, W]; NaN where that gives none."""
-    low, high = float(np.fmin.reduce(mono, axis=None)), float(np.fmax.reduce(mono, axis=None))
-    ends = [low, high, 0.0] if low <= 0 <= high else [low, high]
-    return float(np.fmin.reduce(aligned_inverse(np.array(ends), alignment)))
-
-
 def predicted(mono: np.ndarray) -> np.ndarray:
     """Pixels at which the network said something, bool: finite, and not the zero of a saturated ReLU.
 
@@ -232,7 +225,7 @@ def _fitted(mono: np.ndarray, geometric: np.ndarray, kind: MonoKind, settings: A
     x, depth = (values.ravel()[rows].astype(np.float64) for values in (mono, geometric))
     if _central_range(x) <= 1e-6 * np.abs(x).max():
         return Alignment(AlignStatus.FLAT, kind, anchors=count)
-    if _central_range(depth) <= MIN_SPREAD * median(depth):
+    if _central_range(depth) <= MIN_SPREAD * float(np.median(depth)):
         return Alignment(AlignStatus.ONE_DEPTH, kind, anchors=count)
     target = 1 / depth if kind == "relative" else depth
     relative = settings.residual == "relative"
@@ -270,7 +263,7 @@ def _subsample(count: int) -> np.ndarray | slice:
 
 def _central_range(values: np.ndarray) -> float:
     """Width of the central 90 %: a handful of leverage points must not pass for spread."""
-    return quantile(values, 0.95) - quantile(values, 0.05)
+    return float(np.quantile(values, 0.95)) - float(np.quantile(values, 0.05))
 
 
 def _check(mono: np.ndarray, geometric: np.ndarray, kind: str) -> None:

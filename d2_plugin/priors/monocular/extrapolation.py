@@ -11,7 +11,6 @@ from __future__ import annotations
 import numpy as np
 
 from d2_plugin.priors.monocular.align import unjudged_line
-from d2_plugin.priors.monocular.order import median, quantile
 from d2_plugin.priors.monocular.settings import AlignSettings
 from d2_plugin.recordings.recording import MonoKind
 
@@ -41,9 +40,9 @@ def extrapolation_error(
     known = (anchors > 0) & (aligned > 0)
     if not known.any():
         return np.zeros(aligned.shape)
-    depth = np.where(aligned > 0, aligned, median(aligned[known])).astype(np.float64)
-    held = np.clip(depth, quantile(depth[known], RANGE[0]), quantile(depth[known], RANGE[1]))
-    near, far = (quantile(anchors[known], share) for share in (THIRD, 1 - THIRD))
+    depth = np.where(aligned > 0, aligned, float(np.median(aligned[known]))).astype(np.float64)
+    held = np.clip(depth, float(np.quantile(depth[known], RANGE[0])), float(np.quantile(depth[known], RANGE[1])))
+    near, far = (float(np.quantile(anchors[known], share)) for share in (THIRD, 1 - THIRD))
     error, beyond = np.zeros(aligned.shape), np.flatnonzero(depth != held)
     parted = []
     for rest in (anchors > near, anchors < far):

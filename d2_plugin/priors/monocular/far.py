@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 
 from d2_plugin.priors.extras import opencv
-from d2_plugin.priors.monocular.order import quantile
 
 CLEARLY = 0.4
 """Inverse depth, in units of that of the farthest anchors, below which a pixel is clearly beyond."""
@@ -41,7 +40,7 @@ def far_pixels(inverse: np.ndarray, geometric: np.ndarray, image: np.ndarray) ->
     if anchors.size == 0:
         return np.zeros(geometric.shape, bool)
     cv2: Any = opencv("finding the sky")
-    farthest = quantile(anchors, 0.995)
+    farthest = float(np.quantile(anchors, 0.995))
     if np.fmin.reduce(inverse, axis=None) * farthest >= CLEARLY:
         return np.zeros(geometric.shape, bool)
     beyond = np.where(np.isfinite(inverse), inverse, np.inf) * farthest

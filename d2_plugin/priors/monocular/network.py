@@ -10,6 +10,7 @@ import hashlib
 import logging
 import mmap
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, get_args
@@ -42,21 +43,30 @@ class NetworkInput:
     height: int | None
     width: int | None
     dtype: type
+    leading: int = 1
+    """Axes in front of the channels."""
 
     @classmethod
-    def of(cls, session: Any, path: Path) -> NetworkInput:
-        """The only input of a session.
+    def of(cls, session: Any, path: Path, views: int | None = None) -> NetworkInput:
+        """The only input of a session, of one image or of so many `views` of an instant.
 
         Raises:
-            D2Error: more than one input, another layout than [1, 3, H, W], or other numbers than floats.
+            D2Error: more than one input, another layout than [1, 3, H, W] or [1, V, 3, H, W], another number of
+                views, or other numbers than floats.
         """
-        inputs = session.get_inputs()
+        inputs, layout = session.get_inputs(), "[1, 3, H, W]" if views is None else "[1, V, 3, H, W] or [V, 3, H, W]"
         if len(inputs) != 1:
-            raise D2Error(f"{path} has {len(inputs)} inputs: export a network with one image input [1, 3, H, W]")
-        shape, dtypes = inputs[0].shape, {"tensor(float)": np.float32, "tensor(float16)": np.float16}
+            raise D2Error(f"{path} has {len(inputs)} inputs: export a network with one image input {layout}")
+        whole, dtypes = inputs[0].shape, {"tensor(float)": np.float32, "tensor(float16)": np.float16}
+        shape = whole[1:] if views is not None and len(whole) == 5 else whole
         if len(shape) != 4 or (shape[1] not in (3, None) and isinstance(shape[1], int)):
-            raise D2Error(f"{path} takes {shown(shape)}: export a network whose input is [1, 3, H, W]")
-        if isinstance(shape[0], int) and shape[0] > 1:
+            raise D2Error(f"{path} takes {shown(whole)}: export a network whose input is {layout}")
+        if views is not None and isinstance(shape[0], int) and shape[0] != views:
+            raise D2Error(
+                f"{path} was exported for {shape[0]} views and would be wrong for {views} without saying so: train "
+                f"with {shape[0]} cameras, or export it for {views}"
+            )
+        if views is None and isinstance(shape[0], int) and shape[0] > 1:
             raise D2Error(f"{path} takes {shape[0]} images at once: export it with a batch of 1, or of free size")
         if inputs[0].type not in dtypes:
             raise D2Error(f"{path} takes {inputs[0].type}: export a network that takes float32 or float16")
@@ -66,7 +76,7 @@ class NetworkInput:
                 "for a smaller input, or a free one"
             )
         height, width = (size if isinstance(size, int) and size > 0 else None for size in shape[2:])
-        return cls(inputs[0].name, height, width, dtypes[inputs[0].type])
+        return cls(inputs[0].name, height, width, dtypes[inputs[0].type], len(whole) - 3)
 
 
 class MonocularModel:
@@ -77,6 +87,7 @@ class MonocularModel:
         kind: `relative` (inverse depth) or `metric` (depth).
         preprocessing: `depth_anything_v2` (cubic resize, ImageNet mean and deviation), `unit` (0..1), or `auto`.
         threads: of one inference; one per worker process is fastest for frames that are independent.
+        views: how many views of an instant it sees at once; None for a network of one image.
 
     Raises:
         D2Error: no such file, no ONNX network, an input that is no image, or an unknown kind.
@@ -84,7 +95,12 @@ class MonocularModel:
     """
 
     def __init__(
-        self, path: Path | str, kind: MonoKind, preprocessing: Preprocessing = "auto", threads: int = 1
+        self,
+        path: Path | str,
+        kind: MonoKind,
+        preprocessing: Preprocessing = "auto",
+        threads: int = 1,
+        views: int | None = None,
     ) -> None:
         self.path, self.kind = Path(path), kind
         if kind not in KINDS:
@@ -92,7 +108,7 @@ class MonocularModel:
         if preprocessing not in PREPROCESSINGS:
             raise unknown_name("preprocessing", preprocessing, PREPROCESSINGS)
         self.session = _session(self.path, threads)
-        self.input = NetworkInput.of(self.session, self.path)
+        self.input = NetworkInput.of(self.session, self.path, views)
         self.preprocessing = _recognised(self.input) if preprocessing == "auto" else preprocessing
         self.provider = self.session.get_providers()[0]
         logger.info("%s: %s, preprocessing %s", self.path.name, self.provider, self.preprocessing)
@@ -103,14 +119,20 @@ class MonocularModel:
 
     def predict(self, image: np.ndarray) -> np.ndarray:
         """The prediction float32 [h, w] at the size the network returns."""
-        tensor = self.prepare(image)
-        height, width = tensor.shape[2:]
-        with parsing(f"what {self.path} makes of an image of {width}x{height}", "export the network for this size"):
-            output = np.asarray(self.session.run(None, {self.input.name: tensor})[0], np.float32)
+        output = next(iter(self.arrays([image]).values()))
         prediction = np.squeeze(output, axis=tuple(axis for axis in range(output.ndim - 2) if output.shape[axis] == 1))
         if prediction.ndim != 2 or min(prediction.shape) < 2:
             raise D2Error(f"{self.path} returns {output.shape}: expected one map [1, H, W] or [1, 1, H, W]")
         return prediction
+
+    def arrays(self, images: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
+        """All outputs of the network for the views of one instant, by their names."""
+        tensor = np.concatenate([self.prepare(image) for image in images])
+        tensor = tensor.reshape((1,) * (self.input.leading - 1) + tensor.shape)
+        height, width = tensor.shape[-2:]
+        with parsing(f"what {self.path} makes of an image of {width}x{height}", "export the network for this size"):
+            outputs = self.session.run(None, {self.input.name: tensor})
+            return {out.name: np.asarray(a, np.float32) for out, a in zip(self.session.get_outputs(), outputs)}
 
     def prepare(self, image: np.ndarray) -> np.ndarray:
         """The network's input [1, 3, h, w] for an RGB uint8 image."""

@@ -31,7 +31,6 @@ from d2_plugin.priors.extras import opencv
 from d2_plugin.priors.maps_on_disk import divided
 from d2_plugin.priors.monocular.correct import corrected_depth, corrected_without
 from d2_plugin.priors.monocular.extrapolation import extrapolation_error
-from d2_plugin.priors.monocular.order import median, quantile
 from d2_plugin.priors.settings import AlignSettings
 from d2_plugin.recordings.recording import MonoKind
 
@@ -106,7 +105,7 @@ def monocular_uncertainty(
     geometric: np.ndarray,
     settings: AlignSettings,
     confidence: np.ndarray | None = None,
-    kind: MonoKind = "relative",
+    kind: MonoKind | None = "relative",
 ) -> Uncertainty:
     """How wrong the corrected map may be, from the anchors that can be left out.
 
@@ -114,9 +113,10 @@ def monocular_uncertainty(
         aligned: aligned monocular depth before local correction [H, W], 0 where it has none.
         geometric: D^g, the anchors [H, W], 0 where there are none.
         settings: of the local correction.
-        confidence: the map's own, 0..1 [H, W]: errors are spread as 1 / confidence besides, and how large they are is
-            measured as ever. None is 1 everywhere.
-        kind: what the map is: its line is one in inverse depth or in depth.
+        confidence: the map's own, in any unit [H, W]: errors are spread as 1 / confidence besides, and how large they
+            are is measured as ever. None is 1 everywhere.
+        kind: what the map is: its line is one in inverse depth or in depth. None is a map known up to a scale, which
+            has no line to draw on.
     """
     small, anchors = _shrunk(aligned), _shrunk(geometric)
     sure = None if confidence is None else _relative(_shrunk(confidence))
@@ -127,7 +127,8 @@ def monocular_uncertainty(
     corrected = corrected_depth(small, anchors, settings)
     usual, without_own = error_shape(corrected, anchors)
     between = HARDER * skill.tail * skill.scale * divided(usual, sure)
-    sigma = _enlarged(np.hypot(between, extrapolation_error(small, anchors, kind, settings)), aligned.shape)
+    beyond = 0.0 if kind is None else extrapolation_error(small, anchors, kind, settings)
+    sigma = _enlarged(np.hypot(between, beyond), aligned.shape)
     left_out = AT_ANCHORS * skill.tail * skill.scale * divided(without_own, sure)
     at_anchors = _enlarged(left_out, aligned.shape)
     usable = (aligned > 0) & (sigma < HOPELESS) & (not skill.nil)
@@ -152,11 +153,11 @@ def measured_skill(
         errors.append(_log_error(depth, anchors, place))
         ratios.append(errors[-1] / divided(shape, None if confidence is None else confidence.ravel()[place]))
     # The map was aligned to all anchors, those left out among them: so the constant is the median of all.
-    constant = np.full(anchors.shape, median(anchors[anchors > 0]), np.float32)
+    constant = np.full(anchors.shape, np.median(anchors[anchors > 0]), np.float32)
     flat = corrected_without(constant, anchors, holes[:COMPARED], settings)
     without = [_log_error(depth, anchors, place) for depth, place in zip(flat, places)]
-    compared, alone = (median(np.concatenate(each)) for each in (errors[:COMPARED], without))
-    all_ratios, error = np.concatenate(ratios), median(np.concatenate(errors))
+    compared, alone = (float(np.median(np.concatenate(each))) for each in (errors[:COMPARED], without))
+    all_ratios, error = np.concatenate(ratios), float(np.median(np.concatenate(errors)))
     scale = _scale(all_ratios, int(np.count_nonzero(anchors)))
     return Skill(scale, error, alone / max(compared, np.finfo(float).tiny), _tail(all_ratios, scale))
 
@@ -189,7 +190,7 @@ def error_shape(depth: np.ndarray, anchors: np.ndarray, at: np.ndarray | None = 
     by_label = np.zeros(int(label.max()) + 1, np.float32)
     by_label[label[known]] = log_anchors
     gap = np.abs(chosen(log_depth) - by_label[chosen(label)])
-    beyond = np.maximum(chosen(log_depth) - np.float32(median(log_anchors)), 0)
+    beyond = np.maximum(chosen(log_depth) - np.median(log_anchors), 0)
     nowhere_above = np.where(predicted, log_depth, np.float32(-EVER))
     nowhere_below = np.where(predicted, log_depth, np.float32(EVER))
 
@@ -221,12 +222,12 @@ def _log_error(depth: np.ndarray, anchors: np.ndarray, place: np.ndarray) -> np.
 
 def _tail(ratios: np.ndarray, scale: float) -> float:
     """How far errors in units of their shape go beyond the usual ones of that scale, 1 at least."""
-    return float(max(quantile(ratios, IN_TAIL) / (USUAL_TAIL * scale), 1))
+    return float(max(np.quantile(ratios, IN_TAIL) / (USUAL_TAIL * scale), 1))
 
 
 def _scale(ratios: np.ndarray, anchors: int) -> float:
     """The 68 % quantile of errors in units of their shape, from few anchors not below what is usual."""
-    measured = quantile(ratios, 0.68)
+    measured = float(np.quantile(ratios, 0.68))
     share = anchors / (anchors + EVIDENCE)
     return float(max(measured, measured**share * USUAL ** (1 - share)))
 

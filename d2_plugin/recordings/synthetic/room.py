@@ -141,9 +141,9 @@ class SyntheticSource(Source):
         depth = self.depth(camera, frame)
         fixed = np.random.default_rng([self.seed, 1, number])
         changing = np.random.default_rng([self.seed, 2, number, frame])
-        bias = FIXED_BIAS * _smooth_field(fixed, depth.shape) + FRAME_BIAS * _smooth_field(changing, depth.shape)
+        bias = FIXED_BIAS * smooth_field(fixed, depth.shape) + FRAME_BIAS * smooth_field(changing, depth.shape)
         scale, shift = changing.uniform(*SCALE), changing.uniform(*SHIFT)
-        inverse = _blurred(1 / depth.astype(np.float64), EDGE_BLUR * depth.shape[1])
+        inverse = blurred(1 / depth.astype(np.float64), EDGE_BLUR * depth.shape[1])
         return (scale * inverse * (1 + bias) + shift).astype(np.float32)
 
     def _kept(
@@ -208,7 +208,7 @@ def _about_z(angle: float) -> np.ndarray:
     return np.array([[math.cos(angle), -math.sin(angle), 0], [math.sin(angle), math.cos(angle), 0], [0, 0, 1]])
 
 
-def _smooth_field(rng: np.random.Generator, shape: tuple[int, ...], cells: int = 4) -> np.ndarray:
+def smooth_field(rng: np.random.Generator, shape: tuple[int, ...], cells: int = 4) -> np.ndarray:
     """Random field [H, W] of about unit variance with `cells` bumps across, from a few cosines."""
     v, u = (np.arange(size) / size for size in shape)
     waves = rng.uniform(-cells / 2, cells / 2, (12, 2))
@@ -217,7 +217,7 @@ def _smooth_field(rng: np.random.Generator, shape: tuple[int, ...], cells: int =
     return np.cos(2 * math.pi * turns + phases[:, None, None]).sum(axis=0) / math.sqrt(6)
 
 
-def _blurred(values: np.ndarray, sigma: float) -> np.ndarray:
+def blurred(values: np.ndarray, sigma: float) -> np.ndarray:
     """Gaussian blur of [H, W] with edge values repeated."""
     reach = max(1, math.ceil(3 * sigma))
     taps = np.exp(-0.5 * (np.arange(-reach, reach + 1) / max(sigma, 1e-6)) ** 2)

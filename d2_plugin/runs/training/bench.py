@@ -67,6 +67,8 @@ class TrainingBench(Settings):
     """ONNX model of monocular depth; the recordings' own maps if not given."""
     mono_kind: Literal["relative", "metric"] | None = None
     """What the model returns."""
+    multiview: str | None = None
+    """Depth of all views from one network: a folder with FRAME.npz, or an ONNX file."""
     config: Path | None = None
     """TOML file with tables of settings over the defaults, for every method."""
     label: str = ""
@@ -158,7 +160,7 @@ def _lines(
     settings: TrainingBench, text: str, presets: Sequence[Preset], known: Sequence[Row], command: str
 ) -> Iterator[Line]:
     """One line per method of a case; points and priors are made here, before anything is measured."""
-    shown = ("backbone", "frames", "hold_out_instants", "downscale", "mono_onnx", "mono_kind")
+    shown = ("backbone", "frames", "hold_out_instants", "downscale", "mono_onnx", "mono_kind", "multiview")
     tables = {} if settings.config is None else read_toml(settings.config, "write TOML tables, or leave out --config")
     base = RunSettings("", (), **{n: getattr(settings, n) for n in shown}, overrides=tables)
     case = case_of(text, base)

@@ -55,7 +55,9 @@ class Work:
 def fingerprint(work: Work) -> str:
     """Hash of everything that decides a run, without folders."""
     table = work.settings.as_table()
-    table |= {name: Path(table[name]).name for name in ("recording", "priors", "mono_onnx") if table.get(name)}
+    table |= {
+        name: Path(table[name]).name for name in ("recording", "priors", "mono_onnx", "multiview") if table.get(name)
+    }
     return hash_of(table, None if work.guidance is None else dict(work.guidance.identity()))
 
 

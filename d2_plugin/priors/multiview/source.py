@@ -1,0 +1,203 @@
+"""Where multi-view depth comes from, files or a network in ONNX, and how it gets the one scale of the recording."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from d2_plugin.errors import D2Error, unknown_name
+from d2_plugin.priors.extras import opencv
+from d2_plugin.priors.frame import Frame, digest
+from d2_plugin.priors.maps_on_disk import planar
+from d2_plugin.priors.monocular.network import MonocularModel
+from d2_plugin.priors.multiview.predicted import Predicted, declared, prediction_files, read_prediction, understood
+from d2_plugin.priors.multiview.scale import log_ratio, world_scale
+from d2_plugin.priors.settings import PriorSettings
+from d2_plugin.recordings.recording import Camera, Recording
+from d2_plugin.store.files import EntryFolder, hash_of
+from d2_plugin.values import shown
+
+VERSION = 1  # raise it when this file changes what it returns, so that caches are not trusted
+SCALED_AT = 3
+"""At so many instants, spread over the recording, its scale is measured; their median counts."""
+CROPPED = 0.05
+"""Maps and images may differ by this share in their ratio of width to height: networks round to patches of 14."""
+
+
+CAMERAS = ("poses", "intrinsics")
+"""What is cached of a prediction beside its maps."""
+
+
+class MultiviewMap(NamedTuple):
+    """Depth of one view, in the recording's one scale."""
+
+    depth: np.ndarray
+    """Planar, float32 [H, W], NaN where there is none."""
+    confidence: np.ndarray
+    """float32 [H, W] in a unit of the network's own, 0 where there is no depth."""
+
+
+def multiview_about(path: Path) -> str:
+    """The source as a person reads it."""
+    emulated = path.is_dir() and declared(path).get("emulated") is True
+    return f"depth of all views from {path.name}{' (emulated)' if emulated else ''}"
+
+
+class MultiviewSource:
+    """Multi-view depth of a recording.
+
+    Args:
+        recording: whose cameras and images.
+        names: the training cameras.
+        settings: `multiview` and its kin.
+        cache: folder for the predictions of an ONNX network.
+        read: reads the images of one frame.
+
+    Raises:
+        D2Error: no such files or network, or a network for another number of views.
+    """
+
+    def __init__(
+        self,
+        recording: Recording,
+        names: Sequence[str],
+        settings: PriorSettings,
+        cache: Path,
+        read: Callable[[int], Frame],
+    ) -> None:
+        path, self.settings, self.read = Path(settings.multiview or ""), settings, read
+        self.cameras = {name: camera for name, camera in recording.cameras.items() if name in names}
+        self.frames, self.model = recording.frames, None
+        self.orders = [list(self.cameras), list(recording.cameras)]
+        self._last: dict[int, Predicted] = {}
+        self._scale: tuple[float, Predicted] | None = None
+        if path.suffix.lower() == ".onnx":
+            self.model = MonocularModel(
+                path, "metric", settings.mono_preprocessing, settings.mono_threads, views=len(self.cameras)
+            )
+            self.files, self._fingerprint = {}, self.model.fingerprint()
+        else:
+            self.files = prediction_files(path)
+            self._read_order(declared(path).get("cameras"), path, recording)
+        self.entries = EntryFolder(cache, synced=False)
+        self.about = multiview_about(path)
+
+    def _read_order(self, cameras: Any, folder: Path, recording: Recording) -> None:
+        if cameras is None:
+            return
+        if not isinstance(cameras, list) or not cameras:
+            raise D2Error(f"{folder}/multiview.json has cameras {shown(cameras)}, expected a list of names: correct it")
+        for name in (*cameras, *self.cameras):
+            if name not in recording.cameras or name not in cameras:
+                raise unknown_name(f"camera in {folder}/multiview.json", str(name)[:40], recording.cameras)
+        self.orders = [cameras]
+
+    def has(self, frame: int) -> bool:
+        """Whether there is anything of this frame."""
+        return self.model is not None or frame in self.files
+
+    def key(self, frame: Frame) -> str:
+        """Hash of all that the maps of a frame depend on."""
+        if not self.has(frame.number):
+            return "none"
+        prediction, settings = self._predicted(frame.number), self.settings
+        arrays = [None if array is None else digest(array) for array in prediction]
+        factor = round(self._factor(frame.number), 12)
+        return hash_of(VERSION, arrays, settings.multiview_scale, settings.multiview_along, factor)
+
+    def views(self, frame: Frame) -> dict[str, MultiviewMap]:
+        """The maps of one frame at the images' sizes, by camera; none where the network saw no such frame."""
+        if not self.has(frame.number):
+            return {}
+        prediction, factor = self._predicted(frame.number), self._factor(frame.number)
+        return {
+            name: self._brought(camera, prediction, place, factor)
+            for place, (name, camera) in enumerate(self.cameras.items())
+        }
+
+    def _brought(self, camera: Camera, prediction: Predicted, place: int, factor: float = 1.0) -> MultiviewMap:
+        """One view at its camera's size. What a network matched fixes depth over focal length, so its own goes out."""
+        cv2, size = opencv("multi-view depth"), (camera.width, camera.height)
+        depth = prediction.depth[place]
+        stretched = depth.shape[1] * camera.height / (depth.shape[0] * camera.width)
+        if abs(stretched - 1) > CROPPED:
+            raise D2Error(
+                f"multi-view maps of {depth.shape[1]}x{depth.shape[0]} do not belong to images of {size[0]}x{size[1]} "
+                f"(camera {camera.name}): export them without cropping or padding"
+            )
+        if prediction.intrinsics is not None:
+            focal = float(prediction.intrinsics[place][0, 0])
+            factor = factor * camera.K[0, 0] * depth.shape[1] / camera.width / focal if focal > 0 else factor
+        enlarged = cv2.resize(np.float32(factor) * depth, size, interpolation=cv2.INTER_LINEAR)
+        enlarged = planar(enlarged, camera) if self.settings.multiview_along == "ray" else enlarged
+        sure = cv2.resize(prediction.confidence[place], size, interpolation=cv2.INTER_LINEAR)
+        return MultiviewMap(enlarged, np.where(np.isfinite(enlarged), sure, 0))
+
+    def _factor(self, number: int) -> float:
+        """What brings the maps of a frame to the recording's scale: what stands still is as far as at the first."""
+        if self.settings.multiview_scale == "metric":
+            return 1.0
+        if self._scale is None:
+            there = [frame for frame in self.frames if self.has(frame)]
+            first = self._predicted(there[0])
+            spread = np.unique(np.linspace(0, len(there) - 1, SCALED_AT).round().astype(int))
+            logs = np.array([self._measured(there[place], first) for place in spread])
+            logs = logs[np.isfinite(logs)]
+            self._scale = float(np.median(logs)) if logs.size else 0.0, first
+        scale, first = self._scale
+        return float(np.exp(scale - self._against(number, first)))
+
+    def _against(self, number: int, first: Predicted) -> float:
+        now = self._predicted(number).depth
+        if now.shape != first.depth.shape:
+            raise D2Error(
+                f"multi-view maps of frame {number} are {now.shape} and those of the first {first.depth.shape}: export "
+                "all at one size"
+            )
+        return log_ratio(now, first.depth)
+
+    def _measured(self, number: int, first: Predicted) -> float:
+        """Log of the scale of the recording from one frame; NaN where it does not tell."""
+        prediction = self._predicted(number)
+        brought = {name: self._brought(c, prediction, i) for i, (name, c) in enumerate(self.cameras.items())}
+        maps = {name: surer_half(*map_) for name, map_ in brought.items()}
+        return float(np.log(world_scale(maps, self.cameras, prediction.poses))) + self._against(number, first)
+
+    def _predicted(self, number: int) -> Predicted:
+        """The prediction of one frame, of the training cameras in their order; the last two are kept."""
+        if number not in self._last:
+            found = self._computed(number) if self.model is not None else self._stored(self.files[number])
+            self._last = dict([*self._last.items()][-1:]) | {number: found}
+        return self._last[number]
+
+    def _stored(self, path: Path) -> Predicted:
+        prediction = read_prediction(path, tuple(dict.fromkeys(len(order) for order in self.orders)))
+        order = next(order for order in self.orders if len(order) == len(prediction.depth))
+        places = [order.index(name) for name in self.cameras]
+        poses, intrinsics = (None if array is None else array[places] for array in prediction[2:])
+        return Predicted(prediction.depth[places], prediction.confidence[places], poses, intrinsics)
+
+    def _computed(self, number: int) -> Predicted:
+        """What the network says, computed once; depth and confidence are kept, and its poses beside them."""
+        assert self.model is not None
+        frame = self.read(number)
+        images = [frame.images[name] for name in self.cameras]
+        key = hash_of(VERSION, self._fingerprint, [frame.hashes[name] for name in self.cameras])
+        entry = self.entries.find_current("all", number, key)
+        if entry is None:
+            found = understood(self.model.arrays(images), str(self.model.path), (len(images),))
+            small = {name: None if a is None else a.tolist() for name, a in found._asdict().items() if name in CAMERAS}
+            maps = np.stack([found.depth, found.confidence])
+            self.entries.write("all", number, maps, {"key": key, "about": self.about} | small)
+            return found
+        depth, sure = entry.array()
+        return Predicted(depth, sure, *(None if (a := entry.record[name]) is None else np.array(a) for name in CAMERAS))
+
+
+def surer_half(depth: np.ndarray, confidence: np.ndarray) -> np.ndarray:
+    """Depth [H, W] where confidence is not below its median, NaN elsewhere: without skies and edges."""
+    known = confidence[confidence > 0]
+    return np.where(confidence >= np.median(known), depth, np.float32(np.nan)) if known.size else depth
