@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.emulated_multiview import emulated_multiview
 from d2_plugin.recordings.recording import Recording, Source
-from d2_plugin.recordings.synthetic.multiview import emulated_multiview
 
 Shown = Callable[[str, int], "np.ndarray | None"]
 

@@ -13,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from prior_cases import contents, showing, write_multiview
 
+from benchmarks.emulated_multiview import emulated_multiview
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.build import PriorSettings, build_priors
 from d2_plugin.priors.declared_error import held_against_truth
@@ -24,7 +25,6 @@ from d2_plugin.priors.settings import StereoSettings
 from d2_plugin.protocol import Label
 from d2_plugin.recordings.cameras.rotations import rotation_of_vector
 from d2_plugin.recordings.recording import Camera, Recording
-from d2_plugin.recordings.synthetic.multiview import emulated_multiview
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.runs.plan import plan_scene
 from d2_plugin.store.store import PriorStore
