@@ -6,9 +6,9 @@ It comes from the folder of a run, a run that trains, the views of any trainer, 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ from d2_plugin.gaussians.moving import Harmonics, MovingGaussians
 from d2_plugin.protocol import View
 from d2_plugin.recordings import Camera, Recording, Source
 from d2_plugin.runs.run import Run
-from d2_plugin.runs.saved import load_checkpoint
+from d2_plugin.runs.saved import load_checkpoint, read_metrics
 from d2_plugin.runs.start import TimedPoints
 from d2_plugin.store.store import PriorStore
 from d2_plugin.viewing.camera_paths import for_size
@@ -47,6 +47,8 @@ class ViewedRun:
     points: np.ndarray | None = None
     """Triangulated surface points [P, 3]."""
     device: str = "cpu"
+    scores: Mapping[str, float] = field(default_factory=dict)
+    """PSNR of each scored camera, and under "" that of all held-out ones, as far as it is known."""
     note: str = ""
     """What a person should know about it, in one sentence."""
     time_scale: float = 1.0
@@ -102,7 +104,10 @@ def viewed_run(folder: Path) -> ViewedRun:
     hooks = (load_checkpoint(folder / "checkpoint.pt", "cpu") or {}).get("d2") or {}
     note = "" if trained.step >= total else f"{folder.name} still trains: this is step {trained.step} of {total}"
     adapter: Any = registry.load(registry.ADAPTERS, run.settings.backbone)
-    return replace(_of_run(run, adapter(trained.model), hooks.get("inserted_at")), note=note)
+    scores: dict[str, float] = {}
+    if (folder / "metrics.json").is_file() and (table := read_metrics(folder))["test"] is not None:
+        scores = {"": table["test"]["psnr"]} | {row["camera"]: row["psnr"] for row in table["per_camera"]}
+    return replace(_of_run(run, adapter(trained.model), hooks.get("inserted_at")), note=note, scores=scores)
 
 
 def viewed_training(run: Run, trainer: Any) -> ViewedRun:

@@ -15,11 +15,8 @@ costs no precision inside. Keys have positions, and shapes and opacities of the 
 
 from __future__ import annotations
 
-import gzip
 import math
-import zlib
-from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -32,13 +29,10 @@ from d2_plugin.viewing.export.ply import ALPHA_MIN
 
 BLOCK = 256
 """Rows that share their ranges."""
-COMPRESSION = 6
 MARGINAL_REACH = math.sqrt(-2 * math.log(MARGINAL_CUT))
 """Standard deviations from mu_t at which a Gaussian is cut off: F = `MARGINAL_CUT`."""
 HARMONIC_BITS = (8, 6, 5, 4, 3)
 """Of all coefficients of a colour but the constant one: the first that fits."""
-SAMPLED = 16
-"""One block in so many is compressed to estimate the size of harmonics."""
 
 
 class Coded(NamedTuple):
@@ -73,16 +67,6 @@ def encode(name: str, values: np.ndarray, bits: int = 16, decode: bool = False) 
     return Coded(
         name, ranges.tobytes() + body, rows, columns, bits, None if decoded is None else torch.from_numpy(decoded)
     )
-
-
-def packed(arrays: Sequence[Coded]) -> tuple[list[dict[str, Any]], bytes]:
-    """A table of contents, and all arrays behind each other, compressed."""
-    contents, offset = [], 0
-    for array in arrays:
-        entry = {"name": array.name, "rows": array.rows, "columns": array.columns, "bits": array.bits}
-        contents.append(entry | {"offset": offset})
-        offset += len(array.data)
-    return contents, gzip.compress(b"".join(array.data for array in arrays), COMPRESSION, mtime=0)
 
 
 class CodedScene(NamedTuple):
@@ -162,23 +146,12 @@ def _code_state(state: State) -> list[Coded]:
 
 
 def _code_colors(harmonics: Harmonics, most_bytes: float = math.inf) -> list[Coded]:
-    """The constant colours, and the harmonics above them in at most `most_bytes` if need be."""
+    """The constant colours, and the harmonics above them in at most `most_bytes` if need be: codes compress at least to
+    their bits."""
     coefficients = harmonics.coefficients
     arrays = [encode("colors", coefficients[:, 0].numpy())]
     if coefficients.shape[1] > 1:
         more = coefficients[:, 1:].flatten(1).numpy()
-        arrays.append(encode("harmonics", more, _bits_that_fit(more, most_bytes), decode=True))
+        fitting = [bits for bits in HARMONIC_BITS if more.size * bits / 8 <= most_bytes]
+        arrays.append(encode("harmonics", more, fitting[0] if fitting else HARMONIC_BITS[-1], decode=True))
     return arrays
-
-
-def _bits_that_fit(values: np.ndarray, most_bytes: float) -> int:
-    """By a sample of the blocks, compressed."""
-    blocks = np.arange(len(values)) // BLOCK
-    rows = blocks % SAMPLED == 0 if len(values) > 4 * SAMPLED * BLOCK else blocks >= 0
-    for bits in HARMONIC_BITS[:-1]:
-        if values.nbytes // 8 <= most_bytes:
-            return bits
-        size = len(zlib.compress(encode("sample", values[rows], bits).data, COMPRESSION))
-        if size * len(values) / rows.sum() <= most_bytes:
-            return bits
-    return HARMONIC_BITS[-1]

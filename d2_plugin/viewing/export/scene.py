@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -14,8 +14,8 @@ from torch import Tensor
 from d2_plugin.gaussians.moving import Harmonics, MovingGaussians
 from d2_plugin.gaussians.spherical_harmonics import coefficients_from_rgb
 from d2_plugin.protocol import RasterSettings, Splats
-from d2_plugin.recordings import Camera
-from d2_plugin.viewing.camera_paths import focus_of
+from d2_plugin.recordings import Camera, Recording
+from d2_plugin.viewing.camera_paths import Rig, at_pose
 from d2_plugin.viewing.export.ply import scales_and_rotations
 from d2_plugin.viewing.viewed import ViewedRun
 
@@ -25,6 +25,10 @@ class ExportScene:
     """What the formats write."""
 
     name: str
+    """Of the run."""
+    recording: Recording
+    scores: Mapping[str, float]
+    """See `ViewedRun.scores`."""
     frames: tuple[int, ...]
     """Numbers of the frames, as the recording has them."""
     seconds: tuple[float, ...]
@@ -64,24 +68,27 @@ class ExportScene:
         inside = ((pixels > 0) & (pixels < pixels.new_tensor([camera.width, camera.height]))).all(1)
         return torch.where((depth > self.raster.near) & inside, depth, 0)
 
-    def outlook(self) -> dict[str, list[float]]:
-        """Where a player may start, in world units: `focus` is what the training cameras look at, `up`, and
-        `depth_range` from the hundredth-nearest to the hundredth-farthest opaque Gaussian that one of them sees, at the
-        first, the middle and the last frame."""
-        cameras, depths = self.train_cameras, []
+    @property
+    def cameras(self) -> tuple[Camera, ...]:
+        """Training cameras, then those that are held out."""
+        return (*self.train_cameras, *self.test_cameras)
+
+    def outlook(self) -> dict[str, Any]:
+        """Where a player may start and how far it may go, in world units: `focus` is what the cameras look at, `up`, a
+        camera `home`, `limits`, and `depth_range` from the hundredth-nearest to the hundredth-farthest opaque Gaussian
+        that a training camera sees, at the first, the middle and the last frame."""
+        depths = []
         for time in sorted({self.seconds[0], self.seconds[len(self.seconds) // 2], self.seconds[-1]}):
             splats = self.splats_at(time)
             opaque = splats.means[splats.opacities > 0.5].double()
-            depths += [self._seen_depth(camera, opaque) for camera in cameras]
+            depths += [self._seen_depth(camera, opaque) for camera in self.train_cameras]
         seen = torch.cat(depths)
         known = seen[seen > 0].numpy()
         near, middle, far = np.quantile(known, [0.01, 0.5, 0.99]) if len(known) else (1.0, 1.5, 2.0)
-        axes = np.stack([camera.T_camera_world[:3, :3] for camera in cameras])
-        focus = focus_of(np.stack([camera.centre for camera in cameras]), axes[:, 2], float(middle))
-        up = -axes[:, 1].mean(axis=0)
-        up = up / np.linalg.norm(up) if np.linalg.norm(up) > 1e-6 else -axes[0, 1]
-        ends = [float(near), float(max(far, near * (1 + 1e-6)))]
-        return {"focus": focus.tolist(), "up": up.tolist(), "depth_range": ends}
+        rig, ends = Rig.of(self.cameras, float(middle)), [float(near), float(max(far, near * (1 + 1e-6)))]
+        home = at_pose(self.train_cameras[0], rig.home)
+        places = {"focus": rig.focus.tolist(), "up": rig.up.tolist(), "limits": rig.limits(self.cameras)}
+        return places | {"home": home, "depth_range": ends}
 
     def still_at(self, time: float) -> tuple[MovingGaussians, tuple[Tensor, Tensor]]:
         """The Gaussians of one instant with its colours, and their scales [M, 3] and quaternions [M, 4]."""
@@ -128,7 +135,9 @@ def export_scene(viewed: ViewedRun) -> ExportScene:
         moving = model.moving()
     behind = getattr(model, "background", None)
     return ExportScene(
-        recording.name,
+        viewed.name,
+        recording,
+        viewed.scores,
         recording.frames,
         tuple(recording.seconds(frame) for frame in recording.frames),
         recording.fps,

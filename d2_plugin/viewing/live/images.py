@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 
+import numpy as np
 from torch import Tensor
 
 from d2_plugin.viewing.live.page import Page, Wanted
@@ -87,10 +88,24 @@ def draw(page: Page, wanted: Wanted, marked: Tensor | None, seconds: float | Non
     start = time.perf_counter()
     size = resolution.size(wanted.aspect, wanted.height, seconds)
     known = wanted.marked and marked is not None and len(marked) == len(viewed.backbone)
-    view = viewed.view(wanted.camera(*size), wanted.time)
+    view, compared = viewed.view(wanted.camera(*size), wanted.time), wanted.recorded > 0 or wanted.show == "error"
+    if wanted.standing is not None and compared:
+        camera, frame = viewed.recording.cameras[wanted.standing], viewed.frame_at(wanted.time)
+        shape = max(round(size[1] * camera.width / camera.height), 1), size[1]
+        view = viewed.view(camera, viewed.recording.seconds(frame), shape)
     shot = Shot(viewed, view, None, wanted.min_opacity, marked if known else None)
+    image = KINDS[wanted.show](shot).image
+    if wanted.recorded > 0:
+        image = np.rint((1 - wanted.recorded) * image + wanted.recorded * shot.truth).astype(np.uint8)
     quality = STILL_QUALITY if seconds is None else MOVING_QUALITY
-    scene.set_background_image(KINDS[wanted.show](shot).image, format="jpeg", jpeg_quality=quality)
+    scene.set_background_image(_filled(image, size[0]), format="jpeg", jpeg_quality=quality)
     taken = time.perf_counter() - start
     resolution.drew(size[0] * size[1], taken)
     page.set_text("size", f"{size[0]}x{size[1]}, {1000 * taken:.0f} ms")
+
+
+def _filled(image: np.ndarray, width: int) -> np.ndarray:
+    """The image [H, W, 3] with another width: black is added, or cut, alike on both sides."""
+    missing = max(width - image.shape[1], 0)
+    cut = max(image.shape[1] - width, 0) // 2
+    return np.pad(image, ((0, 0), (missing // 2, missing - missing // 2), (0, 0)))[:, cut : cut + width]

@@ -46,19 +46,17 @@ class Overlay:
             self._show_cloud(viewed, frame, moving)
 
     def _show_frusta(self, viewed: ViewedRun, frame: int, moving: bool) -> None:
-        visible = self.page.ticked("frusta", True)
+        # Those around would stand before the image of the camera where we stand.
+        visible = self.page.ticked("frusta", True) and self.page.standing is None
         if visible and set(self.frusta) != set(viewed.recording.cameras):
             for number, (name, camera) in enumerate(viewed.recording.cameras.items()):
                 if name not in self.frusta:
                     self.frusta[name] = self._frustum(number, camera, name in viewed.train_cameras)
             self._images_of = None
         scale = self.unit * self.page.number("size_of_frusta", 1.0)
-        eye = np.array(self.page.eye)
-        for name, handle in self.frusta.items():
-            # One that stands where we do would fill the screen with its small image.
-            near = np.linalg.norm(viewed.recording.cameras[name].centre - eye) < 1.5 * scale
-            if handle.visible != (visible and not near):
-                handle.visible = visible and not near
+        for handle in self.frusta.values():
+            if handle.visible != visible:
+                handle.visible = visible
             if handle.scale != scale:
                 handle.scale = scale
         if visible and not moving and frame != self._images_of:
@@ -75,7 +73,8 @@ class Overlay:
             vertical_angle(camera),
             camera.width / camera.height,
             scale=self.unit,
-            thickness=0.04 * self.unit,
+            thickness=1.5,
+            thickness_units="screen",
             color=TRAINING if trains else HELD_OUT,
             wxyz=quaternion_of_rotation(camera.T_camera_world[:3, :3].T),
             position=camera.centre,
@@ -102,21 +101,14 @@ class Overlay:
 
 
 def frustum_size(viewed: ViewedRun) -> float:
-    """A tenth of the way from the cameras to what they look at, or less where cameras stand close together."""
+    """A part of the way from the cameras to what they look at, or less where cameras stand close together."""
     centres = np.stack([camera.centre for camera in viewed.recording.cameras.values()])
     gaps = np.linalg.norm(centres[:, None] - centres[None], axis=-1)
     gaps[gaps == 0] = math.inf
     # The usual gap: a held-out camera that nearly touches another must not make all of them too small to see.
     usual = float(np.median(gaps.min(axis=1)))
-    size = min((viewed.depth or math.inf) / 10, 0.5 * usual)
+    size = min((viewed.depth or math.inf) / 25, 0.25 * usual)
     return size if math.isfinite(size) else 0.2
-
-
-def rig_of(viewed: ViewedRun) -> tuple[np.ndarray, float]:
-    """Where the cameras' middle is, [3], and how far one has to be from it to see all of them."""
-    centres = np.stack([camera.centre for camera in viewed.recording.cameras.values()])
-    middle = centres.mean(axis=0)
-    return middle, max(float(np.linalg.norm(centres - middle, axis=1).max()), 3 * frustum_size(viewed))
 
 
 class Cloud(NamedTuple):

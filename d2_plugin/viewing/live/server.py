@@ -11,6 +11,7 @@ import functools
 import io
 import secrets
 import socket
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stdout
 from http import HTTPStatus
@@ -52,6 +53,8 @@ def serve(host: str, port: int) -> Page:
         D2Error: nothing can listen at that address.
     """
     _check_address(host)
+    # Of a page that was closed while its image was drawn.
+    warnings.filterwarnings("ignore", "Queued a .* on a closed connection")
     token = secrets.token_urlsafe(16)
     with redirect_stdout(io.StringIO()), _guarded(Access(host, token)):  # it prints a table with addresses
         server = viser().ViserServer(host=host, port=port, label="D2-4DGS", verbose=False)

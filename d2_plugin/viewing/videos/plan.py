@@ -58,7 +58,7 @@ class RenderSettings(Settings):
     height: Annotated[int, Range(1, 16384, unit="pixels")] | None = None
     """Height of each image; by default the camera's, or in proportion to the width."""
     format: Format = "mp4"
-    """mp4 (H.264 that browsers play), webp or gif (animated, in loops), png (one file per image)."""
+    """mp4 (H.264 that browsers play), webp (animated, in a loop), png (one file per image)."""
     quality: Annotated[int, Range(0, 51)] = 18
     """Constant rate factor of mp4, 0 is lossless; the quality of webp is 100 less twice this."""
     no_captions: bool = False
@@ -161,7 +161,7 @@ def _from_file(viewed: ViewedRun, settings: RenderSettings) -> tuple[list[Stop],
     if not settings.path.endswith(".json"):
         raise unknown_name("camera path", settings.path, [*STANDING, *MOVING, "FILE.json"])
     path = read_camera_path(Path(settings.path))
-    fps = settings.fps or path.fps
+    fps = settings.fps or (len(path.cameras) / settings.seconds if settings.seconds else path.fps)
     if path.shares is not None and settings.at is None:
         times = [share * viewed.duration for share in path.shares]
     else:

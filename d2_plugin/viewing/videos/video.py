@@ -1,4 +1,4 @@
-"""Images into a file that others play: MP4 for browsers, animated WebP or GIF for a page, PNGs for measurements.
+"""Images into a file that others play: MP4 for browsers, animated WebP for a page, PNGs for measurements.
 
 H.264 with half the colour resolution needs even sides: an image of odd width or height gets one more column or row, a
 copy of its last. Nothing is scaled. Scores are never computed from a video.
@@ -25,7 +25,7 @@ from d2_plugin.reading import said
 from d2_plugin.recordings.images import checked_image, write_png
 from d2_plugin.values import checked_arguments
 
-Format = Literal["mp4", "webp", "gif", "png"]
+Format = Literal["mp4", "webp", "png"]
 RATES = (0.001, 1000.0)
 """Images per second that files of videos can say."""
 
@@ -43,7 +43,6 @@ class Encoding(NamedTuple):
 ENCODINGS = {
     "mp4": Encoding("mp4", "libx264", "yuv420p", {"movflags": "+faststart"}),
     "webp": Encoding("webp", "libwebp_anim", "yuv420p", {"loop": "0"}),
-    "gif": Encoding("gif", "gif", "pal8", {"loop": "0"}),
 }
 
 Add = Callable[[np.ndarray], None]
@@ -57,7 +56,7 @@ def write_video(path: Path, form: Format, fps: float, quality: int = 18) -> Iter
 
     Args:
         path: the file; a folder of 00000.png, ... for `png`.
-        form: mp4 (H.264, yuv420p, fast start), webp and gif (endless loops), or png.
+        form: mp4 (H.264, yuv420p, fast start), webp (an endless loop), or png.
         fps: images per second.
         quality: x264's constant rate factor for mp4, 0 is lossless and 51 the worst; webp's quality is 100 less twice
             this number.
@@ -103,7 +102,6 @@ class _Encoder:
         encoding = ENCODINGS[form]
         self.container: Any = av.open(str(path), "w", format=encoding.muxer, options=encoding.options)
         self.stream: Any = None
-        self.palette: Any = None
 
     def add(self, image: np.ndarray) -> None:
         image = checked_image(image, "an image of a video")
@@ -121,22 +119,12 @@ class _Encoder:
             frame = frame.reformat(format="yuv420p", interpolation=colors.Interpolation.AREA, **to)
         frame.pts, frame.time_base = self.count, 1 / self.rate
         self.count += 1
-        if self.form == "gif":  # kept until the end: the palette is that of all images
-            self.palette = self.palette or self._palette(frame)
-            self.palette[0].push(frame)
-        else:
-            self.container.mux(self.stream.encode(frame))
+        self.container.mux(self.stream.encode(frame))
 
     def close(self) -> None:
         """Write what is still inside."""
         if self.stream is None:
             raise D2Error("a video without an image: choose a longer path or more frames")
-        if self.palette is not None:
-            source, sink = self.palette
-            source.push(None)
-            with suppress(self.av.error.EOFError, self.av.error.BlockingIOError):
-                while True:
-                    self.container.mux(self.stream.encode(sink.pull()))
         self.container.mux(self.stream.encode())
         self.container.close()
 
@@ -152,21 +140,6 @@ class _Encoder:
             context, colors = self.stream.codec_context, self.av.video.reformatter
             context.colorspace, context.color_range = colors.Colorspace.ITU709, colors.ColorRange.MPEG
             context.color_primaries, context.color_trc = colors.ColorPrimaries.BT709, colors.ColorTrc.BT709
-
-    def _palette(self, frame: Any) -> tuple[Any, Any]:
-        """Where images go in, and where they come out with the one palette of all of them."""
-        graph = self.graph = self.av.filter.Graph()  # kept alive: it owns both ends
-        size = {"width": frame.width, "height": frame.height}
-        source = graph.add_buffer(**size, format=frame.format, time_base=frame.time_base)
-        split, palette, use = graph.add("split"), graph.add("palettegen"), graph.add("paletteuse", "dither=bayer")
-        sink = graph.add("buffersink")
-        source.link_to(split)
-        split.link_to(palette, 0, 0)
-        split.link_to(use, 1, 0)
-        palette.link_to(use, 0, 1)
-        use.link_to(sink)
-        graph.configure()
-        return source, sink
 
 
 def _rate(fps: float) -> Fraction:
