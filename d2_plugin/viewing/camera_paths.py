@@ -1,7 +1,7 @@
 """Camera paths: a camera for each image of a video, made from the cameras of a recording or read.
 
 All poses are `T_camera_world` [4, 4] float64 in OpenCV axes. Two to four cameras cover a small part of the sphere
-around a scene, and what they did not see cannot be shown: orbit and spiral stay inside the angle that they span.
+around a scene, and what they did not see cannot be shown: an orbit stays inside the angle that they span.
 
 `read_camera_path` reads nerfstudio's camera_path.json, as its viewer and others write it. There poses are
 camera-to-world in OpenGL axes (x right, y up, z back), the field of view is vertical and in degrees. The path must be
@@ -82,22 +82,6 @@ def orbit(
     start = rig.middle - rig.focus
     around = [rotation_of_vector(np.radians(angle) * rig.up) @ start for angle in angles]
     return [at_pose(cameras[0], look_at(rig.focus + offset, rig.focus, rig.up)) for offset in around]
-
-
-def spiral(cameras: Sequence[Camera], count: int, depth: float | None = None) -> list[Camera]:
-    """LLFF's spiral of two turns about the mean camera, looking at the point that the cameras look at.
-
-    Its radii are half of the 90th percentile of the cameras' distances from their mean, along each axis: the whole
-    of it would leave what an arc of few cameras has seen.
-    """
-    rig = Rig.of(cameras, depth)
-    axes = look_at(rig.middle, rig.focus, rig.up)[:3, :3]
-    offsets = np.abs((np.stack([camera.centre for camera in cameras]) - rig.middle) @ axes.T)
-    radii = 0.5 * np.percentile(offsets, 90, axis=0)
-    radii = np.maximum(radii, 0.02 * np.linalg.norm(rig.focus - rig.middle) * np.array([1, 1, 0]))
-    angle = 4 * np.pi * np.arange(count) / max(count, 1)
-    local = np.stack([np.sin(angle), np.cos(angle) - 1, np.sin(angle / 2)], -1) * radii
-    return [at_pose(cameras[0], look_at(rig.middle + offset @ axes, rig.focus, rig.up)) for offset in local]
 
 
 def through(cameras: Sequence[Camera], count: int) -> list[Camera]:
@@ -242,7 +226,7 @@ def read_camera_path(path: Path) -> CameraPath:
     try:
         table = read_json(path, EXPORT)
     except NoSuchFile:
-        raise D2Error(f"no camera path at {path}: give orbit, spiral, through, held-out, training or a file") from None
+        raise D2Error(f"no camera path at {path}: give orbit, through, held-out, training or a file") from None
     kind, place = table.get("camera_type", "perspective"), str(path)
     if kind != "perspective":
         raise D2Error(f"{path} is for a camera of type {str(kind)[:40]!r}, expected perspective: export it as that")

@@ -64,7 +64,7 @@ def run(settings: Demo) -> str:
     _compare({name: run.folder for name, run in runs.items()}, held_out[len(held_out) // 2], image)
     table = metrics_table(scores)
     page = folder / "player.html"
-    write_page([replace(export_scene(viewed_run(run.folder)), name=name) for name, run in runs.items()], page)
+    write_page([export_scene(replace(viewed_run(run.folder), name=name)) for name, run in runs.items()], page)
     return (
         f"{table}\nThe recording is rendered and its monocular depth is emulated.\nImage: {image}\n"
         f"Player: {page} (open it in a browser; it compares both with the recording, without a network)"

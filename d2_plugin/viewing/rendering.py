@@ -1,4 +1,4 @@
-"""What a camera sees of a backbone: colour, depth, alpha, and the number of Gaussians over each pixel.
+"""What a camera sees of a backbone: colour, depth and alpha.
 
 Everything here goes through the contract (`slice_at`, and `colors` where there is one), so any trainer with an adapter
 can be shown. The trainer's own `render` is not called: it may keep state between two of the trainer's lines.
@@ -6,13 +6,12 @@ can be shown. The trainer's own `render` is not called: it may keep state betwee
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from d2_plugin.protocol import RasterSettings, Splats, View, call_optional
+from d2_plugin.protocol import Splats, View, call_optional
 from d2_plugin.rasterizer import rasterize
 
 SOLID = 0.5
@@ -23,9 +22,6 @@ MARKED = (1.0, 0.45, 0.0)
 """RGB of highlighted Gaussians."""
 FADED = 0.3
 """Share of its brightness that a Gaussian keeps beside highlighted ones."""
-
-THIN = 1e-6
-"""Opacity at which Gaussians do not hide each other."""
 
 
 class RenderedView(NamedTuple):
@@ -57,13 +53,3 @@ def render_view(backbone: Any, view: View, min_opacity: float = 0.0, marked: Ten
     color, depth_sum, alpha = (part.cpu() for part in render[:3])
     depth = torch.where(alpha > SOLID, depth_sum / alpha.clamp(min=SOLID), torch.zeros_like(alpha))
     return RenderedView(color.clamp(0, 1), depth, alpha, splats)
-
-
-@torch.no_grad()
-def gaussians_per_pixel(splats: Splats, view: View, settings: RasterSettings) -> Tensor:
-    """How many Gaussians lie over each pixel, [H, W] float: each counts as its fall-off there, 1 at its centre, whether
-    or not something in front has used up the light."""
-    drawn = torch.nonzero(splats.opacities >= settings.alpha_min).squeeze(-1)
-    thin = Splats(*(part[drawn] for part in splats))._replace(opacities=splats.opacities.new_full((len(drawn),), THIN))
-    bare = replace(settings, alpha_min=THIN * 1e-2, transmittance_min=0.0)
-    return rasterize(thin, thin.means.new_ones(len(drawn), 1), view, bare).alpha.cpu() / THIN

@@ -5,7 +5,6 @@ It comes from the folder of a run, a run that trains, the views of any trainer, 
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -145,26 +144,6 @@ def viewed_recording(recording: Recording, priors: Path | None = None) -> Viewed
             "give the recording that they were built for"
         )
     return ViewedRun(recording.name, recording, store.cameras, store=store)
-
-
-def viewed_store(store: PriorStore, fps: float = 30.0) -> ViewedRun:
-    """The cameras that a prior was built for, with the images that it kept.
-
-    Raises:
-        D2Error: the store is empty, or does not say where its cameras stood.
-    """
-    cameras: dict[str, Camera] = {}
-    for name, frame in itertools.product(store.cameras, store.frames):
-        if name in cameras:
-            continue
-        record, prior = store.camera(name, frame), store.prior(name, frame)
-        if record is not None and prior is not None:
-            height, width = prior.depth.shape
-            cameras[name] = Camera(name, width, height, record.K.numpy(), record.T_camera_world.numpy())
-    if not cameras:
-        raise D2Error(f"{store.path} has no prior that says where its camera stood: give --recording, or build it anew")
-    recording = Recording(store.path.name, cameras, store.frames, fps, KeptImages(cameras, store))
-    return ViewedRun(store.path.name, recording, tuple(cameras), store=store)
 
 
 def viewed_views(views: Sequence[View], backbone: Any, store: Any, name: str) -> ViewedRun:

@@ -26,8 +26,6 @@ from d2_plugin.errors import D2Error
 
 TIME_FREQUENCIES = 10
 """Of the variant that does not encode time by layers, which alone says it by their widths."""
-AXIS_SHIFT = 1e-5
-"""Added to the entries of a screw axis by the repository, after the division by its length."""
 PAIRS = tuple(itertools.combinations(range(4), 2))
 """Of x, y, z, t: which two coordinates each plane of a level has."""
 HEADS = {
@@ -95,17 +93,12 @@ def encoded(values: Tensor, frequencies: int) -> Tensor:
 
 
 def screw_motions(turn: Tensor, shift: Tensor) -> Tensor:
-    """Rigid motions [N, 4, 4] of screws: the exponential of (turn, shift), each [N, 3], with angle |turn|."""
-    angle = turn.norm(dim=-1, keepdim=True)
-    axis, along = turn / angle + AXIS_SHIFT, shift / angle + AXIS_SHIFT
+    """Rigid motions [N, 4, 4] of screws: the exponential of (turn, shift), each [N, 3]."""
+    twist = turn.new_zeros(len(turn), 4, 4)
     # Columns are the products of the axis with the unit vectors.
-    K = torch.linalg.cross(axis[:, None].expand(-1, 3, -1), torch.eye(3).to(axis).expand(len(axis), -1, -1)).mT
-    one, angle = torch.eye(3).to(axis), angle[..., None]
-    rotation = one + angle.sin() * K + (1 - angle.cos()) * (K @ K)
-    reach = angle * one + (1 - angle.cos()) * K + (angle - angle.sin()) * (K @ K)
-    motion = torch.eye(4).to(axis).repeat(len(axis), 1, 1)
-    motion[:, :3, :3], motion[:, :3, 3:] = rotation, reach @ along[..., None]
-    return motion
+    twist[:, :3, :3] = torch.linalg.cross(turn[:, None], torch.eye(3).to(turn)[None]).mT
+    twist[:, :3, 3] = shift
+    return torch.linalg.matrix_exp(twist)
 
 
 class PlaneField:

@@ -31,8 +31,8 @@ BLOCK = 256
 """Rows that share their ranges."""
 MARGINAL_REACH = math.sqrt(-2 * math.log(MARGINAL_CUT))
 """Standard deviations from mu_t at which a Gaussian is cut off: F = `MARGINAL_CUT`."""
-HARMONIC_BITS = (8, 6, 5, 4, 3)
-"""Of all coefficients of a colour but the constant one: the first that fits."""
+HARMONIC_BITS = 8
+"""Of all coefficients of a colour but the constant one."""
 
 
 class Coded(NamedTuple):
@@ -43,11 +43,11 @@ class Coded(NamedTuple):
     rows: int
     columns: int
     bits: int
-    decoded: Tensor | None = None
-    """[rows, columns] float64, the values that a reader finds, where they were asked for."""
+    decoded: Tensor
+    """[rows, columns] float64, the values that a reader finds."""
 
 
-def encode(name: str, values: np.ndarray, bits: int = 16, decode: bool = False) -> Coded:
+def encode(name: str, values: np.ndarray, bits: int = 16) -> Coded:
     """Code `values` [N, C] (or [N]), all finite, in 16 bits, or in at most 8 of a byte."""
     values = np.asarray(values, np.float64)
     values = values[:, None] if values.ndim == 1 else values
@@ -60,31 +60,24 @@ def encode(name: str, values: np.ndarray, bits: int = 16, decode: bool = False) 
     steps = (1 << bits) - 1
     share = (padded - low) / np.where(high > low, high - low, 1)
     codes = np.clip(np.rint(share * steps), 0, steps).astype(np.uint16)
-    decoded = (low + codes * ((high - low) / steps)).reshape(-1, columns)[:rows] if decode else None
+    decoded = (low + codes * ((high - low) / steps)).reshape(-1, columns)[:rows]
     planes = codes.reshape(blocks * BLOCK, columns)[:rows].T
     parts = [planes >> 8, planes & 255] if bits > 8 else [planes]
     body = np.stack(parts, axis=1).astype(np.uint8).tobytes()
-    return Coded(
-        name, ranges.tobytes() + body, rows, columns, bits, None if decoded is None else torch.from_numpy(decoded)
-    )
+    return Coded(name, ranges.tobytes() + body, rows, columns, bits, torch.from_numpy(decoded))
 
 
 class CodedScene(NamedTuple):
     """Arrays and what a reader must know beside them."""
 
     arrays: list[Coded]
-    rows: Tensor
-    """Which of the model's Gaussians each one is."""
+    gaussians: int
     motion: Literal["none", "lines", "keys"]
-    harmonics: Harmonics
-    """The colours of these Gaussians, as they were before they were coded."""
     keys: Keys | None = None
 
 
-def code_lines(gaussians: MovingGaussians, duration: float, most_bytes: float = math.inf) -> CodedScene:
-    """Gaussians on straight lines, or standing still; those that are never seen in the clip are left out.
-
-    Harmonics are coded as coarsely as keeps all arrays, compressed, below `most_bytes`."""
+def code_lines(gaussians: MovingGaussians, duration: float) -> CodedScene:
+    """Gaussians on straight lines, or standing still; those that are never seen in the clip are left out."""
     rows = seen_rows(gaussians, duration)
     rows = rows[torch.from_numpy(morton_order(gaussians.positions[rows].numpy()))]
     chosen = gaussians.select(rows)
@@ -92,8 +85,7 @@ def code_lines(gaussians: MovingGaussians, duration: float, most_bytes: float = 
     positions = chosen.positions
     if chosen.motion is not None:
         velocities, times, sigmas = chosen.motion
-        fading = encode("fading", torch.stack([times, sigmas.log()], -1).numpy(), decode=True)
-        assert fading.decoded is not None
+        fading = encode("fading", torch.stack([times, sigmas.log()], -1).numpy())
         times, sigmas = fading.decoded[:, 0], fading.decoded[:, 1].exp()  # a reader's, so that their error does no harm
         # When each Gaussian is at its position, and how long it goes at most while it is seen.
         anchors, spans = times.clamp(0, duration), (MARGINAL_REACH * sigmas).clamp(max=duration)
@@ -101,9 +93,8 @@ def code_lines(gaussians: MovingGaussians, duration: float, most_bytes: float = 
         arrays += [fading, encode("reaches", (velocities * spans[:, None]).numpy())]
     state = State(positions, cholesky(chosen.covariances), chosen.opacities)
     arrays += _code_state(state)
-    left = most_bytes - sum(len(array.data) for array in arrays) - 6 * len(chosen)
-    arrays += _code_colors(chosen.harmonics, left)
-    return CodedScene(arrays, rows, "none" if chosen.motion is None else "lines", chosen.harmonics)
+    arrays += _code_colors(chosen.harmonics)
+    return CodedScene(arrays, len(rows), "none" if chosen.motion is None else "lines")
 
 
 def code_keys(keys: Keys, harmonics: Harmonics) -> CodedScene:
@@ -115,7 +106,7 @@ def code_keys(keys: Keys, harmonics: Harmonics) -> CodedScene:
         if keys.changing:
             arrays.append(encode(f"shapes_{i}", _shapes(state.factors)))
             arrays.append(encode(f"opacities_{i}", state.opacities.numpy()))
-    return CodedScene(arrays, keys.rows, "keys", own, keys)
+    return CodedScene(arrays, len(keys.rows), "keys", keys)
 
 
 def _shapes(factors: Tensor) -> np.ndarray:
@@ -145,13 +136,10 @@ def _code_state(state: State) -> list[Coded]:
     ]
 
 
-def _code_colors(harmonics: Harmonics, most_bytes: float = math.inf) -> list[Coded]:
-    """The constant colours, and the harmonics above them in at most `most_bytes` if need be: codes compress at least to
-    their bits."""
+def _code_colors(harmonics: Harmonics) -> list[Coded]:
+    """The constant colours, and the harmonics above them."""
     coefficients = harmonics.coefficients
     arrays = [encode("colors", coefficients[:, 0].numpy())]
     if coefficients.shape[1] > 1:
-        more = coefficients[:, 1:].flatten(1).numpy()
-        fitting = [bits for bits in HARMONIC_BITS if more.size * bits / 8 <= most_bytes]
-        arrays.append(encode("harmonics", more, fitting[0] if fitting else HARMONIC_BITS[-1], decode=True))
+        arrays.append(encode("harmonics", coefficients[:, 1:].flatten(1).numpy(), HARMONIC_BITS))
     return arrays

@@ -13,7 +13,7 @@ from d2_plugin.durable import make_folder, remove_leftovers
 from d2_plugin.errors import D2Error
 from d2_plugin.locks import only_writer
 from d2_plugin.progress import progress_bar
-from d2_plugin.settings import Count, Downscale, Positional, Range, Settings
+from d2_plugin.settings import Count, Downscale, Positional, Settings
 from d2_plugin.viewing.checkpoints import open_viewed
 from d2_plugin.viewing.export.fourdgs import write_4dgs
 from d2_plugin.viewing.export.page import write_page
@@ -29,16 +29,15 @@ class Export(Settings):
     """Which run is exported, as what."""
 
     runs: Annotated[tuple[Path, ...], Positional()]
-    """The --output of `d2 train`; or what an official trainer wrote, with --recording. Two make a page that compares."""
+    """The --output of `d2 train`, of two runs for a page that compares; or what an official trainer wrote, with
+    --recording."""
     format: Literal["html", "ply", "sog", "spz", "glb", "4dgs"] = "html"
-    """html: one page that plays the scene, or compares two, without a network. ply, sog, spz, glb (glTF): a file for each
-    frame. 4dgs: the moving scene."""
+    """html: one page that plays the scene, or compares two, without a network. ply, sog, spz, glb (glTF): a file for
+    each frame. 4dgs: the moving scene."""
     output: Path | None = None
     """Folder to write into; `export` inside the last run's folder if not given."""
     frames: tuple[Count, ...] | None = None
     """first:last or first:last:step, the last one included, of a file for each frame; all frames if not given."""
-    megabytes: Annotated[float, Range(1e-3, 1e6)] = 40.0
-    """Size of an html page that key times of a deformation field, or harmonics in 8 bits, may bring it to."""
     recording: Path | None = None
     """The recording of a checkpoint of an official trainer."""
     train_cameras: tuple[str, ...] | None = None
@@ -74,7 +73,7 @@ def write_export(scenes: list[ExportScene], settings: Export, folder: Path) -> W
     with only_writer(make_folder(folder)):
         remove_leftovers(folder)
         if settings.format == "html":
-            return [folder / "scene.html"], write_page(scenes, folder / "scene.html", settings.megabytes)
+            return [folder / "scene.html"], write_page(scenes, folder / "scene.html")
         if settings.format == "4dgs":
             paths, notes = [folder / "scene.4dgs"], write_4dgs(scene, folder / "scene.4dgs")
         else:

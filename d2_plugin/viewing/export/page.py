@@ -12,28 +12,22 @@ from string import Template
 from typing import Any
 
 import numpy as np
-import torch
 
 import d2_plugin
 from d2_plugin.durable import refuse_foreign, write_text
 from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.slicing import MARGINAL_CUT
-from d2_plugin.gaussians.spherical_harmonics import colors
 from d2_plugin.reading import json_text
 from d2_plugin.recordings import Camera
 from d2_plugin.recordings.images import opencv
 from d2_plugin.runs.drawing import color_scale
 from d2_plugin.viewing.export.coded import BLOCK, MARGINAL_REACH, CodedScene, code_keys, code_lines
-from d2_plugin.viewing.export.keys import SAMPLE, bake
+from d2_plugin.viewing.export.keys import bake
 from d2_plugin.viewing.export.scene import ExportScene
 from d2_plugin.viewing.panels import fitted
 
 GENERATOR = "d2-4dgs"
-TEXT_PER_BYTE = 4 / 3
-"""Base64."""
 COMPRESSION = 6
-BYTES_AT_REST, BYTES_OF_POSITION, BYTES_OF_SHAPE = 28, 6, 16
-"""Per Gaussian, with 16-bit codes and before compression, without harmonics."""
 RASTER = ("near", "blur", "alpha_max", "alpha_min", "fov_clamp")
 """Settings of the rasterizer that the player's shaders obey."""
 PAGE_SCRIPTS = ("controls.js", "scene.js", "shaders.js", "renderer.js", "pace.js", "player.js")
@@ -44,62 +38,57 @@ CONTROLS_HEIGHT = 50
 """Pixels below the image."""
 
 
-class _Data:
-    """What a page holds besides text: parts behind each other."""
-
-    def __init__(self) -> None:
-        self.parts: list[bytes] = []
-        self.size = 0
-
-    def add(self, part: bytes) -> int:
-        """Append; returns where it begins."""
-        self.parts.append(part)
-        self.size += len(part)
-        return self.size - len(part)
+def _placed(data: bytearray, part: bytes) -> int:
+    """Append a part to the data of a page; returns where it begins."""
+    data += part
+    return len(data) - len(part)
 
 
-def write_page(scenes: Sequence[ExportScene], path: Path, megabytes: float = 40.0) -> list[str]:
-    """Write the page of one scene, or of two of one recording to compare, in about `megabytes`; returns what it says.
-
-    Straight lines round their harmonics to fit if need be, any other scene is baked at as many key times as fit.
+def write_page(scenes: Sequence[ExportScene], path: Path) -> list[str]:
+    """Write the page of one scene, or of two of one recording to compare; returns what it says of itself.
 
     Raises:
         D2Error: scenes of different recordings, or a file that `d2 export` did not write.
     """
     refuse_foreign(path, f'content="{GENERATOR} ', "d2 export")
-    last, data = scenes[-1], _Data()
+    last, data = scenes[-1], bytearray()
     for scene in scenes:
         where = [[camera.name for camera in one.cameras] for one in (scene, last)]
         if scene.frames != last.frames or sorted(where[0]) != sorted(where[1]):
-            raise D2Error(f"{scene.name} and {last.name} are of different recordings: compare runs of one recording")
+            raise D2Error(
+                f"{scene.viewed.name} and {last.viewed.name} are of different recordings: compare runs of one recording"
+            )
     images = _recorded(last, data)
     models, about = [], []
     for scene in scenes:
-        coded = _coded(scene, megabytes / len(scenes))
+        moving = scene.moving
+        coded = code_keys(bake(scene), scene.harmonics) if moving is None else code_lines(moving, scene.duration)
         models.append(_model(scene, coded, data))
-        about += [f"{scene.name}: {line}" if len(scenes) > 1 else line for line in _about(scene, coded)]
+        about += [f"{scene.viewed.name}: {line}" if len(scenes) > 1 else line for line in _about(scene, coded)]
     if images:
         count, size = sum(map(len, images.values())), sum(length for kept in images.values() for _, _, length in kept)
         about.append(f"{count} recorded images of the cameras {', '.join(images)}: {size / 1e6:.1f} MB of the page")
     camera = last.cameras[0]
     wide = 640, round(640 * camera.height / camera.width) + CONTROLS_HEIGHT
     about += [
-        f"{len(last.frames)} frame{'s' * (len(last.frames) > 1)} at {last.fps:g} per second",
+        f"{len(last.frames)} frame{'s' * (len(last.frames) > 1)} at {last.viewed.recording.fps:g} per second",
         f'to embed: <iframe src="{path.name}" width="{wide[0]}" height="{wide[1]}" allow="fullscreen"></iframe>',
         f"made by d2-4dgs {d2_plugin.__version__}; no network is used",
     ]
     header = _header(last) | {"models": models, "recorded": images, "about": about}
-    write_text(path, _assembled(last.recording.name, header, b"".join(data.parts)))
+    write_text(path, _assembled(last.viewed.recording.name, header, bytes(data)))
     return about
 
 
-def _recorded(scene: ExportScene, data: _Data) -> dict[str, list[tuple[int, int, int]]]:
+def _recorded(scene: ExportScene, data: bytearray) -> dict[str, list[tuple[int, int, int]]]:
     """Images of the held-out cameras: of each the place of the frame, where it stands and its length."""
-    cameras = scene.test_cameras or scene.train_cameras
+    names = scene.viewed.test_cameras or scene.viewed.train_cameras
+    recording = scene.viewed.recording
+    cameras = [recording.cameras[name] for name in names]
     cv2 = opencv("a page with recorded images")
 
     def image(camera: Camera, place: int) -> bytes:
-        pixels = scene.recording.image(camera.name, scene.frames[place])
+        pixels = recording.image(camera.name, scene.frames[place])
         height = min(pixels.shape[0], RECORDED_HEIGHT)
         pixels = fitted(pixels, round(pixels.shape[1] * height / pixels.shape[0]), height)
         written: bytes = cv2.imencode(".webp", pixels[..., ::-1], [cv2.IMWRITE_WEBP_QUALITY, RECORDED_QUALITY])[
@@ -113,32 +102,12 @@ def _recorded(scene: ExportScene, data: _Data) -> dict[str, list[tuple[int, int,
     for camera in cameras:
         for place in places:
             written = image(camera, place)
-            kept.setdefault(camera.name, []).append((place, data.add(written), len(written)))
+            kept.setdefault(camera.name, []).append((place, _placed(data, written), len(written)))
     return kept
 
 
-def _coded(scene: ExportScene, megabytes: float) -> CodedScene:
-    most_bytes = (megabytes * 1e6 - len(_assembled("", {}, b""))) / TEXT_PER_BYTE
-    if scene.moving is not None:
-        return code_lines(scene.moving, scene.duration, most_bytes)
-    coefficients = scene.harmonics.coefficients
-    at_rest = len(coefficients) * (BYTES_AT_REST + 3 * (coefficients.shape[1] - 1))
-
-    def most_keys(moving: int, changing: int) -> int:
-        each = moving * BYTES_OF_POSITION + changing * BYTES_OF_SHAPE
-        return max(int((most_bytes - at_rest) / max(1.05 * each, 1)), 2)
-
-    return code_keys(bake(scene, most_keys), scene.harmonics)
-
-
 def _about(scene: ExportScene, coded: CodedScene) -> list[str]:
-    keys, lines = coded.keys, [f"{len(coded.rows):,} Gaussians"]
-    bits = {array.name: array.bits for array in coded.arrays}.get("harmonics", 8)
-    if bits < 8:
-        off = _color_error(scene, coded)
-        lines.append(
-            f"harmonics in {bits} bits, so that the page is no larger: colours off by {off:.1f} of 255 in the mean"
-        )
+    keys, lines = coded.keys, [f"{coded.gaussians:,} Gaussians"]
     if keys is not None:
         lines.append(
             f"a deformation field at {len(keys.times)} key times, straight in between: off by {keys.offset}; "
@@ -151,48 +120,34 @@ def _about(scene: ExportScene, coded: CodedScene) -> list[str]:
     return lines
 
 
-def _color_error(scene: ExportScene, coded: CodedScene) -> float:
-    """Mean difference of the colours that the first training camera sees, of 255; of up to `SAMPLE` Gaussians."""
-    assert scene.moving is not None
-    every = -(-len(coded.rows) // SAMPLE)
-    [decoded] = [array.decoded for array in coded.arrays if array.decoded is not None and array.name == "harmonics"]
-    true = coded.harmonics.coefficients[::every]
-    rounded = torch.cat([true[:, :1], decoded[::every].unflatten(1, (-1, 3))], 1)
-    toward = scene.moving.positions[coded.rows[::every]] - torch.as_tensor(scene.train_cameras[0].centre)
-    phase = torch.zeros(len(true)).double()
-    degrees = coded.harmonics.degree, coded.harmonics.time_degree
-    seen = [colors(part, toward, phase, *degrees) for part in (true, rounded)]
-    return 255 * float((seen[0] - seen[1]).abs().mean())
-
-
-def _model(scene: ExportScene, coded: CodedScene, data: _Data) -> dict[str, Any]:
+def _model(scene: ExportScene, coded: CodedScene, data: bytearray) -> dict[str, Any]:
     """The table of one scene; its arrays go into `data`."""
     kept = ("name", "rows", "columns", "bits")
     return {
-        "name": scene.name,
-        "scores": scene.scores,
-        "count": len(coded.rows),
+        "name": scene.viewed.name,
+        "scores": scene.viewed.scores,
+        "count": coded.gaussians,
         "motion": coded.motion,
         "keys": None if coded.keys is None else coded.keys.times,
-        "degree": coded.harmonics.degree,
-        "time_degree": coded.harmonics.time_degree,
-        "raster": {name: min(getattr(scene.raster, name), 1e6) for name in RASTER},
+        "degree": scene.harmonics.degree,
+        "time_degree": scene.harmonics.time_degree,
+        "raster": {name: min(getattr(scene.viewed.backbone.settings, name), 1e6) for name in RASTER},
         "background": None if scene.background is None else scene.background.tolist(),
-        "arrays": [{name: getattr(a, name) for name in kept} | {"offset": data.add(a.data)} for a in coded.arrays],
+        "arrays": [{name: getattr(a, name) for name in kept} | {"offset": _placed(data, a.data)} for a in coded.arrays],
     }
 
 
 def _header(scene: ExportScene) -> dict[str, Any]:
     outlook = scene.outlook()
     return {
-        "name": scene.recording.name,
+        "name": scene.viewed.recording.name,
         "block": BLOCK,
         "frames": scene.frames,
         "seconds": scene.seconds,
         "duration": scene.duration,
         "marginal_cut": MARGINAL_CUT,
         "marginal_reach": MARGINAL_REACH,
-        "cameras": [_camera(camera, camera in scene.test_cameras) for camera in scene.cameras],
+        "cameras": [_camera(camera, camera.name in scene.viewed.test_cameras) for camera in scene.cameras],
         "palette": color_scale("viridis").tobytes().hex(),
         **outlook,
         "home": _camera(outlook["home"], False),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -13,8 +13,8 @@ from torch import Tensor
 
 from d2_plugin.gaussians.moving import Harmonics, MovingGaussians
 from d2_plugin.gaussians.spherical_harmonics import coefficients_from_rgb
-from d2_plugin.protocol import RasterSettings, Splats
-from d2_plugin.recordings import Camera, Recording
+from d2_plugin.protocol import Splats
+from d2_plugin.recordings import Camera
 from d2_plugin.viewing.camera_paths import Rig, at_pose
 from d2_plugin.viewing.export.ply import scales_and_rotations
 from d2_plugin.viewing.viewed import ViewedRun
@@ -24,19 +24,7 @@ from d2_plugin.viewing.viewed import ViewedRun
 class ExportScene:
     """What the formats write."""
 
-    name: str
-    """Of the run."""
-    recording: Recording
-    scores: Mapping[str, float]
-    """See `ViewedRun.scores`."""
-    frames: tuple[int, ...]
-    """Numbers of the frames, as the recording has them."""
-    seconds: tuple[float, ...]
-    """Time of each frame since the first one."""
-    fps: float
-    train_cameras: tuple[Camera, ...]
-    test_cameras: tuple[Camera, ...]
-    raster: RasterSettings
+    viewed: ViewedRun
     harmonics: Harmonics
     splats_at: Callable[[float], Splats]
     """The 3D Gaussians at a time in seconds; float32, without gradients."""
@@ -46,15 +34,25 @@ class ExportScene:
     """Spherical harmonics [16, 3] of what lies behind all Gaussians."""
 
     @property
+    def frames(self) -> tuple[int, ...]:
+        """Numbers of the frames, as the recording has them."""
+        return self.viewed.recording.frames
+
+    @property
+    def seconds(self) -> tuple[float, ...]:
+        """Time of each frame since the first one."""
+        return tuple(map(self.viewed.recording.seconds, self.frames))
+
+    @property
     def duration(self) -> float:
         """From the first frame to the last, seconds; 0 for one frame."""
-        return self.seconds[-1]
+        return self.viewed.duration
 
     def pixels_per_unit(self, positions: Tensor) -> Tensor:
         """Length [M] in pixels of one world unit across the line of sight, in the training camera that sees a position
         [M, 3] largest; 0 where none does."""
         largest = positions.new_zeros(len(positions))
-        for camera in self.train_cameras:
+        for camera in self.viewed.training:
             depth = self._seen_depth(camera, positions)
             largest = torch.maximum(largest, torch.where(depth > 0, camera.K[0, 0] / depth.clamp(min=1e-30), 0))
         return largest
@@ -64,14 +62,17 @@ class ExportScene:
         pose, K = (torch.as_tensor(matrix).to(positions) for matrix in (camera.T_camera_world, camera.K))
         points = positions @ pose[:3, :3].T + pose[:3, 3]
         depth = points[:, 2]
-        pixels = (points[:, :2] * K.diagonal()[:2]) / depth.clamp(min=self.raster.near)[:, None] + K[:2, 2]
+        pixels = (points[:, :2] * K.diagonal()[:2]) / depth.clamp(min=self.viewed.backbone.settings.near)[:, None] + K[
+            :2, 2
+        ]
         inside = ((pixels > 0) & (pixels < pixels.new_tensor([camera.width, camera.height]))).all(1)
-        return torch.where((depth > self.raster.near) & inside, depth, 0)
+        return torch.where((depth > self.viewed.backbone.settings.near) & inside, depth, 0)
 
     @property
     def cameras(self) -> tuple[Camera, ...]:
         """Training cameras, then those that are held out."""
-        return (*self.train_cameras, *self.test_cameras)
+        names = (*self.viewed.train_cameras, *self.viewed.test_cameras)
+        return tuple(self.viewed.recording.cameras[name] for name in names)
 
     def outlook(self) -> dict[str, Any]:
         """Where a player may start and how far it may go, in world units: `focus` is what the cameras look at, `up`, a
@@ -81,12 +82,12 @@ class ExportScene:
         for time in sorted({self.seconds[0], self.seconds[len(self.seconds) // 2], self.seconds[-1]}):
             splats = self.splats_at(time)
             opaque = splats.means[splats.opacities > 0.5].double()
-            depths += [self._seen_depth(camera, opaque) for camera in self.train_cameras]
+            depths += [self._seen_depth(camera, opaque) for camera in self.viewed.training]
         seen = torch.cat(depths)
         known = seen[seen > 0].numpy()
         near, middle, far = np.quantile(known, [0.01, 0.5, 0.99]) if len(known) else (1.0, 1.5, 2.0)
         rig, ends = Rig.of(self.cameras, float(middle)), [float(near), float(max(far, near * (1 + 1e-6)))]
-        home = at_pose(self.train_cameras[0], rig.home)
+        home = at_pose(self.cameras[0], rig.home)
         places = {"focus": rig.focus.tolist(), "up": rig.up.tolist(), "limits": rig.limits(self.cameras)}
         return places | {"home": home, "depth_range": ends}
 
@@ -113,7 +114,7 @@ class ExportScene:
 @torch.no_grad()
 def export_scene(viewed: ViewedRun) -> ExportScene:
     """What is exported of a run or a checkpoint."""
-    recording, backbone, moving = viewed.recording, viewed.backbone, viewed.moving
+    backbone, moving = viewed.backbone, viewed.moving
     view = viewed.view(viewed.training[0], 0.0)
     model: Any = getattr(backbone, "model", None)  # of the bundled backbones
 
@@ -134,18 +135,5 @@ def export_scene(viewed: ViewedRun) -> ExportScene:
     if moving is None and hasattr(model, "moving"):
         moving = model.moving()
     behind = getattr(model, "background", None)
-    return ExportScene(
-        viewed.name,
-        recording,
-        viewed.scores,
-        recording.frames,
-        tuple(recording.seconds(frame) for frame in recording.frames),
-        recording.fps,
-        tuple(viewed.training),
-        tuple(recording.cameras[name] for name in viewed.test_cameras),
-        backbone.settings,
-        harmonics,
-        splats_at,
-        moving,
-        None if behind is None else torch.cat([behind.constant, behind.harmonics]).detach().double().cpu(),
-    )
+    background = None if behind is None else torch.cat([behind.constant, behind.harmonics]).detach().double().cpu()
+    return ExportScene(viewed, harmonics, splats_at, moving, background)

@@ -29,7 +29,7 @@ REST = 0.3
 WIDEST = 10.0
 """Of an image, relative to its height, or the other way round."""
 SPEEDS = {f"{speed:g}": speed for speed in (0.1, 0.25, 0.5, 1.0, 2.0)}
-IMAGES = {"image": "rgb", "error": "error", "depth": "depth", "opacity": "alpha", "number of Gaussians": "count"}
+IMAGES = {"image": "rgb", "error": "error", "depth": "depth", "opacity": "alpha"}
 """What the menu says -> the kind of image."""
 AT_CAMERA = 1e-3
 """Of the numbers of a pose, relative to a camera's distance: who is so near stands at the camera."""
@@ -126,23 +126,18 @@ class Page:
             controls["camera"] = gui.add_dropdown("stand at", [FREE, *names], initial_value=FREE)
             controls["camera"].on_update(lambda _: self.stand_at(controls["camera"].value))
             controls["frusta"] = gui.add_checkbox("cameras", True)
-            controls["size_of_frusta"] = gui.add_slider("camera size", 0.1, 3.0, 0.1, 1.0)
             if viewed.store is not None:
                 first = "none" if viewed.backbone is not None else "image"
                 controls["cloud"] = gui.add_dropdown("prior as points, by", CLOUDS, initial_value=first)
-                controls["point_size"] = gui.add_slider("point size", 0.2, 5.0, 0.1, 1.0)
         if viewed.backbone is not None:
             self._text("size", "image size")
             with gui.add_folder("Camera path", expand_by_default=False):
                 self._text("keyframes", "keyframes", "none")
                 controls["path_seconds"] = gui.add_slider("seconds to the next", 0.2, 10.0, 0.1, 2.0)
-                for name, act in (("add", self._add), ("remove", self._remove), ("preview", self._preview)):
-                    controls[name] = gui.add_button(f"{name.capitalize()} keyframe" if name != "preview" else "Preview")
-                    controls[name].on_click(lambda _, act=act: act())
-                controls["save"] = gui.add_button("Save camera_path.json")
-                controls["save"].on_click(
-                    lambda _: self.client.send_file_download("camera_path.json", self.path_file())
-                )
+                acts = {"Add keyframe": lambda _: self._keep(1), "Remove the last": lambda _: self._keep(-1)}
+                acts |= {"Preview": lambda _: self._preview(), "Save camera_path.json": lambda _: self._save()}
+                for label, act in acts.items():
+                    gui.add_button(label).on_click(act)
         for control in controls.values():
             if hasattr(control, "on_update"):
                 control.on_update(lambda _: self.wake())
@@ -181,31 +176,31 @@ class Page:
                 return name
         return None
 
-    def _add(self) -> None:
-        if self._last is not None and len(self.keyframes) < MOST_KEYFRAMES:
+    def _keep(self, more: int) -> None:
+        """Make the image that is seen a keyframe, or forget the last one."""
+        if more > 0 and self._last is not None and len(self.keyframes) < MOST_KEYFRAMES:
             self.keyframes.append(self._last)
-        self._count()
-
-    def _remove(self) -> None:
-        del self.keyframes[-1:]
-        self._count()
-
-    def _count(self) -> None:
+        elif more < 0:
+            del self.keyframes[-1:]
         self.set_text("keyframes", str(len(self.keyframes) or "none"))
 
     def path(self) -> list[tuple[Camera, float]]:
-        """The cameras of the path, with their instants in seconds."""
-        chain = [key.camera(PATH_SIZE[0], PATH_SIZE[1]) for key in self.keyframes]
-        seconds = max(self.number("path_seconds", 2.0) * (len(chain) - 1), 1 / PATH_RATE)
-        places = np.linspace(0, max(len(chain) - 1, 0), max(round(seconds * PATH_RATE), 2)) if chain else []
-        times = np.interp(places, range(len(chain)), [key.time for key in self.keyframes]) if chain else []
-        return [(between(chain, place), float(time)) for place, time in zip(places, times)]
+        """The cameras from keyframe to keyframe, with their instants in seconds."""
+        chain = [key.camera(*PATH_SIZE) for key in self.keyframes]
+        seconds = self.number("path_seconds", 2.0) * (len(chain) - 1)
+        places = np.linspace(0, len(chain) - 1, max(round(seconds * PATH_RATE), 1)).tolist() if chain else []
+        times = [float(np.interp(place, range(len(chain)), [key.time for key in self.keyframes])) for place in places]
+        return [(between(chain, place), instant) for place, instant in zip(places, times)]
 
     def path_file(self) -> bytes:
         """The path as nerfstudio's camera_path.json."""
-        cameras, times = zip(*self.path() or [((), ())])
-        shares = [time / max(self.viewed.duration, 1e-9) for time in times]
+        cameras = [camera for camera, _ in self.path()]
+        shares = [instant / max(self.viewed.duration, 1e-9) for _, instant in self.path()]
         return camera_path_text(cameras, shares, PATH_RATE).encode()
+
+    def _save(self) -> None:
+        if self.keyframes:
+            self.client.send_file_download("camera_path.json", self.path_file())
 
     def _preview(self) -> None:
         self._previewed = time.monotonic(), self.path()
@@ -248,7 +243,7 @@ class Page:
         self.wake()
 
     def play(self, now: float) -> None:
-        """Move the slider on where the page plays, at the end it begins again; follow a camera path that is previewed."""
+        """Move the slider on where the page plays, or follow the camera path that it previews."""
         if self._previewed is not None:
             began, path = self._previewed
             place = int((now - began) * PATH_RATE)

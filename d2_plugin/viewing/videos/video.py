@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from fractions import Fraction
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 
@@ -30,20 +30,8 @@ RATES = (0.001, 1000.0)
 """Images per second that files of videos can say."""
 
 
-class Encoding(NamedTuple):
-    """FFmpeg's names for one format."""
-
-    muxer: str
-    codec: str
-    pixels: str
-    options: dict[str, str]
-    """Of the container."""
-
-
-ENCODINGS = {
-    "mp4": Encoding("mp4", "libx264", "yuv420p", {"movflags": "+faststart"}),
-    "webp": Encoding("webp", "libwebp_anim", "yuv420p", {"loop": "0"}),
-}
+CODECS = {"mp4": ("libx264", {"movflags": "+faststart"}), "webp": ("libwebp_anim", {"loop": "0"})}
+"""FFmpeg's name of a format's codec, and the options of its container."""
 
 Add = Callable[[np.ndarray], None]
 """Adds an image, RGB uint8 [H, W, 3], to a video; all have the size of the first."""
@@ -99,8 +87,7 @@ class _Encoder:
 
     def __init__(self, av: Any, path: Path, form: str, rate: Fraction, quality: int) -> None:
         self.av, self.form, self.rate, self.quality, self.count = av, form, rate, quality, 0
-        encoding = ENCODINGS[form]
-        self.container: Any = av.open(str(path), "w", format=encoding.muxer, options=encoding.options)
+        self.container: Any = av.open(str(path), "w", format=form, options=CODECS[form][1])
         self.stream: Any = None
 
     def add(self, image: np.ndarray) -> None:
@@ -129,9 +116,8 @@ class _Encoder:
         self.container.close()
 
     def _begin(self, width: int, height: int) -> None:
-        encoding = ENCODINGS[self.form]
-        self.stream = self.container.add_stream(encoding.codec, rate=self.rate)
-        self.stream.width, self.stream.height, self.stream.pix_fmt = width, height, encoding.pixels
+        self.stream = self.container.add_stream(CODECS[self.form][0], rate=self.rate)
+        self.stream.width, self.stream.height, self.stream.pix_fmt = width, height, "yuv420p"
         if self.form == "webp":
             self.stream.options = {"quality": str(max(100 - 2 * self.quality, 0)), "compression_level": "6"}
         if self.form == "mp4":
