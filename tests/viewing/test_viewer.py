@@ -31,7 +31,7 @@ from d2_plugin.viewing.live.page import Page, Wanted
 from d2_plugin.viewing.live.server import COOKIE, Access
 from d2_plugin.viewing.live.show import ViewSettings, address_line, viewed_at
 from d2_plugin.viewing.live.viewer import MOVED, WATCHED
-from d2_plugin.viewing.viewed import ViewedRun, viewed_store
+from d2_plugin.viewing.viewed import ViewedRun, viewed_recording
 
 pytest.importorskip("viser", reason="viser is in the `view` extra")
 from websockets.datastructures import Headers
@@ -232,7 +232,7 @@ def test_controls_are_those_that_the_subject_has(viewed: ViewedRun) -> None:
     page.build()
     assert {"time", "show", "opacity", "marked", "cloud"} <= set(page.controls)
     assert "pause" not in page.controls
-    bare = Page(looker(), viewed_store(viewed.store), None, 360, lambda: None)
+    bare = Page(looker(), viewed_recording(viewed.recording, viewed.store.path), None, 360, lambda: None)
     bare.build()
     assert "show" not in bare.controls
     assert bare.word("cloud", "") == "image"
@@ -272,7 +272,7 @@ def damaged(client: Any, page: Page) -> list[Callable[[], object]]:
         *(control("opacity", opacity) for opacity in (nan, -1, 7, {})),
         *(control(name, word) for name in ("show", "speed", "cloud", "camera") for word in ("abc", None, 5, [], {})),
         *(control(name, value) for name in ("play", "marked", "frusta") for value in ("abc", nan, None)),
-        *(control(name, value) for name in ("point_size", "size_of_frusta") for value in (nan, "abc", -1)),
+        *(control(name, value) for name in ("recorded", "path_seconds") for value in (nan, "abc", -1, 1e300)),
     ]
 
 

@@ -50,7 +50,7 @@ def write_4dgs(scene: ExportScene, path: Path) -> list[str]:
         sh=codes.flatten(1).byte().numpy() if codes.shape[1] else None,
         sh_degree=shown.harmonics.degree,
     )
-    options = package.WriteOptions(cutoff=MARGINAL_CUT, metadata={"color_space": "srgb-rec709-display"})
+    options = package.WriteOptions("fine", MARGINAL_CUT, metadata={"color_space": "srgb-rec709-display"})
     content = io.BytesIO()
     package.write(content, gaussians, max(scene.duration, 1e-6), options=options)
     write(path, content.getvalue())
