@@ -42,7 +42,8 @@ class Resolution:
         if seconds is not None:
             x, y, xx, xy = self._sums[1:] / self._sums[0]
             spread, whole = xx - x * x, y / x
-            pixel = min(max((xy - x * y) / spread, 0.0), whole) if spread > (APART * x) ** 2 else whole
+            slope = (xy - x * y) / spread if spread > (APART * x) ** 2 else 0.0
+            pixel = min(slope, whole) if slope > 0 else whole  # smaller ones took longer: the machine has other work
             fixed = y - pixel * x
             left = max(seconds - fixed, 0.5 * fixed, 1e-3)
             height = int(min(left / max(pixel, 1e-12) / max(aspect, 1e-3), 1e9) ** 0.5)

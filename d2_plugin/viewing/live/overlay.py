@@ -21,8 +21,8 @@ THUMBNAIL = 128
 """Width of an image in a frustum, pixels."""
 TRAINING, HELD_OUT = (70, 160, 255), (255, 150, 40)
 """RGB of cameras that train and of those that are held out."""
-FRUSTUM = 0.04
-"""Size of a frustum, relative to the distance of what the cameras look at."""
+FRUSTUM, NEAR = 0.03, 12.0
+"""Size of a frustum relative to the distance of what the cameras look at; how near, in its sizes, it is hidden."""
 MOST_POINTS = 60_000
 """Of all cameras together: a browser draws them at every frame."""
 
@@ -55,9 +55,11 @@ class Overlay:
                 if name not in self.frusta:
                     self.frusta[name] = self._frustum(number, camera, name in viewed.train_cameras)
             self._images_of = None
-        for handle in self.frusta.values():
-            if handle.visible != visible:
-                handle.visible = visible
+        for name, handle in self.frusta.items():
+            # One beside us would fill the screen with its small image.
+            far = np.linalg.norm(viewed.recording.cameras[name].centre - self.page.eye) > NEAR * self.unit
+            if handle.visible != (visible and far):
+                handle.visible = visible and far
         if visible and not moving and frame != self._images_of:
             self._images_of = frame
             for name, handle in self.frusta.items():

@@ -163,6 +163,11 @@ class Page:
         return self.controls[name].value is True if name in self.controls else default
 
     @property
+    def eye(self) -> tuple[float, ...]:
+        """Where the browser's camera stands, [3]."""
+        return (0.0, 0.0, 0.0) if self._last is None else self._last.pose[:3]
+
+    @property
     def standing(self) -> str | None:
         """The camera of the recording at which the page stands."""
         return None if self._last is None else self._last.standing
@@ -200,7 +205,7 @@ class Page:
 
     def _save(self) -> None:
         if self.keyframes:
-            self.client.send_file_download("camera_path.json", self.path_file())
+            self.client.send_file_download("camera_path.json", self.path_file(), save_immediately=True)
 
     def _preview(self) -> None:
         self._previewed = time.monotonic(), self.path()

@@ -258,7 +258,8 @@ class TestTheFreeCamera:
     def test_it_stays_where_cameras_stood(self, compared: Page) -> None:
         pushed = """async () => {
             const p = await d2, places = [];
-            const acts = [(c) => c.orbit(0.3, 0), (c) => c.orbit(0, 0.3), (c) => c.approach(3), (c) => c.fly([2, 1, 0])];
+            const acts = [(c) => c.orbit(0.3, 0), (c) => c.orbit(0, 0.3), (c) => c.approach(3), (c) => c.fly([2, 1, 0])
+            ];
             for (const act of acts) {
                 p.camera.place(p.header.home);
                 for (let i = 0; i < 40; i++) act(p.camera);

@@ -27,6 +27,7 @@ class FreeCamera {
   constructor({ up, focus, home, limits }) {
     Object.assign(this, { up, home, limits, middle: focus });
     this.place(home);
+    home.centre = this.centre;
     const flat = plus(this.centre, focus, -1);
     this.ahead = unit(plus(flat, up, -dot(flat, up)));
     this.east = cross(up, this.ahead);

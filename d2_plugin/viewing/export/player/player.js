@@ -87,10 +87,14 @@ class Player {
     addEventListener("blur", () => this.held.clear());
   }
 
-  // As the link says, or at the first held-out camera where there is something to compare, else at home.
+  // As the link says, or at the held-out camera nearest to home where there is something to compare, else at home.
   begin() {
     const { header } = this, given = new URLSearchParams(location.hash.slice(1)), number = (name) => Number(given.get(name)) || 0;
-    const compared = header.cameras.findIndex(({ held_out: held, name }) => held && header.recorded[name]);
+    const far = header.cameras.map(({ held_out: held, name, ...camera }) => {
+      this.camera.place(camera);
+      return held && header.recorded[name] ? Math.hypot(...plus(this.camera.centre, this.camera.home.centre, -1)) : Infinity;
+    });
+    const compared = Math.min(...far) < Infinity ? far.indexOf(Math.min(...far)) : -1;
     byId("left").value = given.get("left") || (header.models.length > 1 || compared < 0 ? 0 : RECORDED);
     byId("right").value = given.get("right") || header.models.length - 1;
     for (const side of ["left", "right"]) if (byId(side).selectedIndex < 0) byId(side).selectedIndex = 0;
@@ -229,11 +233,8 @@ class Player {
     const { clientWidth, clientHeight } = byId("stage"), { width, height } = this.camera.camera;
     const most = Math.max(width / height, LEAST_SHAPE), ratio = devicePixelRatio / coarse;
     const tall = Math.min(clientHeight, clientWidth / LEAST_SHAPE), wide = Math.min(clientWidth, tall * most);
-    for (const id of ["image", "wipe"]) {
-      byId(id).style.width = `${wide}px`;
-      byId(id).style.height = `${tall}px`;
-    }
-    byId("wipe").style.setProperty("--tall", `${tall}px`);
+    byId("stage").style.setProperty("--wide", `${wide}px`);
+    byId("stage").style.setProperty("--tall", `${tall}px`);
     return this.camera.view(Math.max(Math.round(wide * ratio), 1), Math.max(Math.round(tall * ratio), 1));
   }
 
