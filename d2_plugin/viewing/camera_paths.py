@@ -1,12 +1,10 @@
 """Camera paths: a camera for each image of a video, made from the cameras of a recording or read.
 
-All poses are `T_camera_world` [4, 4] float64 in OpenCV axes. Two to four cameras cover a small part of the sphere
-around a scene, and what they did not see cannot be shown: an orbit stays inside the angle that they span.
+All poses are `T_camera_world` [4, 4] float64 in OpenCV axes. What few cameras did not see cannot be shown: an orbit
+stays inside the angle that they span.
 
-`read_camera_path` reads nerfstudio's camera_path.json, as its viewer and others write it. There poses are
-camera-to-world in OpenGL axes (x right, y up, z back), the field of view is vertical and in degrees. The path must be
-in the world of the recording: a `dataparser_transforms.json` beside it, with which nerfstudio turned and scaled that
-world, is undone.
+nerfstudio's camera_path.json has poses camera-to-world in OpenGL axes (x right, y up, z back), and vertical fields of
+view in degrees. A `dataparser_transforms.json` beside it, which turned and scaled the recording's world, is undone.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""What is looked at: Gaussians with the recording they belong to, its cameras and its depth prior.
-
-It comes from the folder of a run, a run that trains, the views of any trainer, a recording or a prior store.
-"""
+"""What is looked at: Gaussians with the recording they belong to, its cameras and its depth prior."""
 
 from __future__ import annotations
 

@@ -7,8 +7,7 @@ the head of the centre is a screw motion.
 
 4DGaussians: a point (x, y, z, t) looks into six planes, one for each pair of its coordinates, on several levels; on a
 level the six features are multiplied, the levels stand beside each other. One hidden layer or more follows, and a head
-of two layers for each attribute that is deformed: offsets of raw positions, log scales, quaternions, opacity logits and
-harmonics.
+of two layers for each attribute that is deformed.
 """
 
 from __future__ import annotations

@@ -1,9 +1,8 @@
 """The arrays of a page: a moving scene as numbers of 16 bits (or 8 and fewer) between the extremes of their block.
 
-Rows are coded in blocks of 256, each column with its own range in each block. Neighbours in space stand in one block
-(`morton_order`), so that the step is small, and a Gaussian far out costs precision in its own block only. An array is
-stored as ranges float32 [blocks, columns, 2], then per column the high bytes of all rows and then the low bytes: bytes
-of one kind beside each other are what a general compressor makes smaller. player/scene.js decodes.
+Rows are coded in blocks of 256 neighbours in space (`morton_order`), each column with its own range in each block, so
+that the step is small. An array is stored as ranges float32 [blocks, columns, 2], then per column the high bytes of all
+rows and then the low bytes, which compress better so. player/scene.js decodes.
 
 Every Gaussian has a position, a size and the six entries of its covariance's Cholesky factor relative to the size, an
 opacity and a colour. Beside those, straight lines have

@@ -85,17 +85,17 @@ def write_export(scenes: list[ExportScene], settings: Export, folder: Path) -> W
 
 def _frame_files(scene: ExportScene, settings: Export, folder: Path) -> list[Path]:
     """One file of Gaussians that stand still for each frame."""
-    chosen = scene.frames if settings.frames is None else settings.frames
+    chosen = scene.viewed.recording.frames if settings.frames is None else settings.frames
     for frame in chosen:
-        if frame not in scene.frames:
-            first, last = scene.frames[0], scene.frames[-1]
+        if frame not in scene.viewed.recording.frames:
+            first, last = scene.viewed.recording.frames[0], scene.viewed.recording.frames[-1]
             raise D2Error(f"the run has no frame {frame}: it has {first} to {last}; name some of those in --frames")
     if not chosen:
         raise D2Error("--frames names no frame: give first:last, or leave it out for all of them")
     make_folder(folder)
     paths = list[Path]()
     with progress_bar(settings.format, len(set(chosen))) as bar, tempfile.TemporaryDirectory() as between:
-        for frame, time in zip(scene.frames, scene.seconds):
+        for frame, time in zip(scene.viewed.recording.frames, scene.seconds):
             if frame in chosen:
                 paths.append(folder / f"frame_{frame:05d}.{settings.format}")
                 ply = paths[-1] if settings.format == "ply" else Path(between) / "frame.ply"

@@ -8,12 +8,12 @@ from __future__ import annotations
 import io
 import math
 from pathlib import Path
-from types import ModuleType
 
 import torch
 
 from d2_plugin.durable import write
-from d2_plugin.errors import D2Error, missing_extra
+from d2_plugin.errors import D2Error
+from d2_plugin.extras import imported
 from d2_plugin.gaussians.moving import LinearMotion
 from d2_plugin.gaussians.slicing import MARGINAL_CUT
 from d2_plugin.gaussians.spherical_harmonics import SH_C0
@@ -32,11 +32,11 @@ def write_4dgs(scene: ExportScene, path: Path) -> list[str]:
         MissingExtra: the package is not installed.
         D2Error: no straight lines.
     """
-    package = _package()
+    package = imported("fourdgs", "fourdgs", "formats", "writing .4dgs")
     notes = [f"written by fourdgs {package.__version__}, which checks the file against its own error bounds"]
     if scene.moving is None:
         raise D2Error("a .4dgs holds straight lines, this model moves by a network: choose --format html or ply")
-    shown = scene.moving.select(seen_rows(scene.moving, scene.duration))
+    shown = scene.moving.select(seen_rows(scene.moving, scene.viewed.duration))
     always = torch.zeros_like(shown.opacities)
     motion = shown.motion or LinearMotion(torch.zeros_like(shown.positions), always, always + math.inf)
     scales, rotations = scales_and_rotations(shown.covariances)
@@ -52,14 +52,6 @@ def write_4dgs(scene: ExportScene, path: Path) -> list[str]:
     )
     options = package.WriteOptions("fine", MARGINAL_CUT, metadata={"color_space": "srgb-rec709-display"})
     content = io.BytesIO()
-    package.write(content, gaussians, max(scene.duration, 1e-6), options=options)
+    package.write(content, gaussians, max(scene.viewed.duration, 1e-6), options=options)
     write(path, content.getvalue())
     return [*notes, f"{count:,} Gaussians; colours stand still, as they are at each one's mean time"]
-
-
-def _package() -> ModuleType:
-    try:
-        import fourdgs
-    except ImportError:
-        raise missing_extra("fourdgs", "formats", "writing .4dgs") from None
-    return fourdgs

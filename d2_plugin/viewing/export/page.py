@@ -54,7 +54,7 @@ def write_page(scenes: Sequence[ExportScene], path: Path) -> list[str]:
     last, data = scenes[-1], bytearray()
     for scene in scenes:
         where = [[camera.name for camera in one.cameras] for one in (scene, last)]
-        if scene.frames != last.frames or sorted(where[0]) != sorted(where[1]):
+        if scene.viewed.recording.frames != last.viewed.recording.frames or sorted(where[0]) != sorted(where[1]):
             raise D2Error(
                 f"{scene.viewed.name} and {last.viewed.name} are of different recordings: compare runs of one recording"
             )
@@ -62,7 +62,7 @@ def write_page(scenes: Sequence[ExportScene], path: Path) -> list[str]:
     models, about = [], []
     for scene in scenes:
         moving = scene.moving
-        coded = code_keys(bake(scene), scene.harmonics) if moving is None else code_lines(moving, scene.duration)
+        coded = code_keys(bake(scene), scene.harmonics) if moving is None else code_lines(moving, scene.viewed.duration)
         models.append(_model(scene, coded, data))
         about += [f"{scene.viewed.name}: {line}" if len(scenes) > 1 else line for line in _about(scene, coded)]
     if images:
@@ -71,7 +71,7 @@ def write_page(scenes: Sequence[ExportScene], path: Path) -> list[str]:
     camera = last.cameras[0]
     wide = 640, round(640 * camera.height / camera.width) + CONTROLS_HEIGHT
     about += [
-        f"{len(last.frames)} frame{'s' * (len(last.frames) > 1)} at {last.viewed.recording.fps:g} per second",
+        f"{len(last.viewed.recording.frames)} frames at {last.viewed.recording.fps:g} per second",
         f'to embed: <iframe src="{path.name}" width="{wide[0]}" height="{wide[1]}" allow="fullscreen"></iframe>',
         f"made by d2-4dgs {d2_plugin.__version__}; no network is used",
     ]
@@ -82,22 +82,19 @@ def write_page(scenes: Sequence[ExportScene], path: Path) -> list[str]:
 
 def _recorded(scene: ExportScene, data: bytearray) -> dict[str, list[tuple[int, int, int]]]:
     """Images of the held-out cameras: of each the place of the frame, where it stands and its length."""
-    names = scene.viewed.test_cameras or scene.viewed.train_cameras
-    recording = scene.viewed.recording
+    recording, names = scene.viewed.recording, scene.viewed.test_cameras or scene.viewed.train_cameras
     cameras = [recording.cameras[name] for name in names]
     cv2 = opencv("a page with recorded images")
 
     def image(camera: Camera, place: int) -> bytes:
-        pixels = recording.image(camera.name, scene.frames[place])
+        pixels = recording.image(camera.name, recording.frames[place])
         height = min(pixels.shape[0], RECORDED_HEIGHT)
         pixels = fitted(pixels, round(pixels.shape[1] * height / pixels.shape[0]), height)
-        written: bytes = cv2.imencode(".webp", pixels[..., ::-1], [cv2.IMWRITE_WEBP_QUALITY, RECORDED_QUALITY])[
-            1
-        ].tobytes()
-        return written
+        quality = [cv2.IMWRITE_WEBP_QUALITY, RECORDED_QUALITY]
+        return bytes(cv2.imencode(".webp", pixels[..., ::-1], quality)[1])
 
     most = max(int(RECORDED_BYTES / sum(len(image(camera, 0)) for camera in cameras)), 1)
-    places = np.unique(np.linspace(0, len(scene.frames) - 1, most).round().astype(int)).tolist()
+    places = np.unique(np.linspace(0, len(recording.frames) - 1, most).round().astype(int)).tolist()
     kept: dict[str, list[tuple[int, int, int]]] = {}
     for camera in cameras:
         for place in places:
@@ -142,9 +139,9 @@ def _header(scene: ExportScene) -> dict[str, Any]:
     return {
         "name": scene.viewed.recording.name,
         "block": BLOCK,
-        "frames": scene.frames,
+        "frames": scene.viewed.recording.frames,
         "seconds": scene.seconds,
-        "duration": scene.duration,
+        "duration": scene.viewed.duration,
         "marginal_cut": MARGINAL_CUT,
         "marginal_reach": MARGINAL_REACH,
         "cameras": [_camera(camera, camera.name in scene.viewed.test_cameras) for camera in scene.cameras],

@@ -1,8 +1,4 @@
-"""The Gaussians of one instant as a 3DGS PLY file, which viewers such as SuperSplat, Brush and SIBR open.
-
-Files named `frame_00000.ply`, `frame_00001.ply`, ... that are dropped together play as an animation in SuperSplat; a
-zip of them does in Brush.
-"""
+"""The Gaussians of one instant as a 3DGS PLY; several that are dropped together play as an animation in SuperSplat."""
 
 from __future__ import annotations
 

@@ -34,19 +34,9 @@ class ExportScene:
     """Spherical harmonics [16, 3] of what lies behind all Gaussians."""
 
     @property
-    def frames(self) -> tuple[int, ...]:
-        """Numbers of the frames, as the recording has them."""
-        return self.viewed.recording.frames
-
-    @property
     def seconds(self) -> tuple[float, ...]:
         """Time of each frame since the first one."""
-        return tuple(map(self.viewed.recording.seconds, self.frames))
-
-    @property
-    def duration(self) -> float:
-        """From the first frame to the last, seconds; 0 for one frame."""
-        return self.viewed.duration
+        return tuple(map(self.viewed.recording.seconds, self.viewed.recording.frames))
 
     def pixels_per_unit(self, positions: Tensor) -> Tensor:
         """Length [M] in pixels of one world unit across the line of sight, in the training camera that sees a position
@@ -97,7 +87,7 @@ class ExportScene:
         own = self.harmonics._replace(coefficients=self.harmonics.coefficients[splats.rows])
         phase = None
         if self.moving is not None and self.moving.motion is not None and own.time_degree:
-            phase = (time - self.moving.motion.times[splats.rows]) / max(self.duration, 1e-12)
+            phase = (time - self.moving.motion.times[splats.rows]) / max(self.viewed.duration, 1e-12)
         means, covariances, opacities = (part.double() for part in splats[:3])
         still = MovingGaussians(means, covariances, opacities, Harmonics(own.without_time(phase), own.degree))
         if self._lasting_shapes is None:

@@ -48,8 +48,9 @@ class Overlay:
             self._show_cloud(viewed, frame, moving)
 
     def _show_frusta(self, viewed: ViewedRun, frame: int, moving: bool) -> None:
+        last = self.page.last
         # Those around would stand before the image of the camera where we stand.
-        visible = self.page.ticked("frusta", True) and self.page.standing is None
+        visible = self.page.ticked("frusta", True) and (last is None or last.standing is None)
         if visible and set(self.frusta) != set(viewed.recording.cameras):
             for number, (name, camera) in enumerate(viewed.recording.cameras.items()):
                 if name not in self.frusta:
@@ -57,7 +58,10 @@ class Overlay:
             self._images_of = None
         for name, handle in self.frusta.items():
             # One beside us would fill the screen with its small image.
-            far = np.linalg.norm(viewed.recording.cameras[name].centre - self.page.eye) > NEAR * self.unit
+            far = (
+                np.linalg.norm(viewed.recording.cameras[name].centre - (last.pose[:3] if last else 0))
+                > NEAR * self.unit
+            )
             if handle.visible != (visible and far):
                 handle.visible = visible and far
         if visible and not moving and frame != self._images_of:

@@ -1,11 +1,10 @@
 """One browser's page: its controls, what it lays over the image, and the image that it wants next.
 
-viser calls back from threads of its own; they only set plain values here. Everything is drawn by the thread that calls
-`Viewer`, so that no image is taken of Gaussians that change.
+viser calls back from threads of its own; they only set plain values here, and the thread that calls `Viewer` draws.
 
 A client may send anything: `Page` takes numbers within the ends of their sliders, words that stand in their menus and a
-camera that can be one, and keeps what it had where a message is none of these. Names come from folders and files of
-others; they go into text fields and menus only, which show any text as it is, never into Markdown or HTML.
+camera that can be one, and keeps what it had where a message is none of these. Names of folders and files go into text
+fields and menus only, which show any text as it is, never into Markdown or HTML.
 """
 
 from __future__ import annotations
@@ -89,7 +88,8 @@ class Page:
     drawn: tuple[Wanted, int, bool] | None = None
     keyframes: list[Wanted] = field(default_factory=list)
     """Of the camera path."""
-    _last: Wanted | None = None
+    last: Wanted | None = None
+    """What it wanted last."""
     _played_at: float | None = None
     _previewed: tuple[float, list[tuple[Camera, float]]] | None = None
 
@@ -162,16 +162,6 @@ class Page:
         """Whether a box is ticked; the default where there is none."""
         return self.controls[name].value is True if name in self.controls else default
 
-    @property
-    def eye(self) -> tuple[float, ...]:
-        """Where the browser's camera stands, [3]."""
-        return (0.0, 0.0, 0.0) if self._last is None else self._last.pose[:3]
-
-    @property
-    def standing(self) -> str | None:
-        """The camera of the recording at which the page stands."""
-        return None if self._last is None else self._last.standing
-
     def _standing(self, pose: tuple[float, ...]) -> str | None:
         R = rotation_of_quaternion(np.array(pose[3:7])).T
         for name, camera in self.viewed.recording.cameras.items():
@@ -183,8 +173,8 @@ class Page:
 
     def _keep(self, more: int) -> None:
         """Make the image that is seen a keyframe, or forget the last one."""
-        if more > 0 and self._last is not None and len(self.keyframes) < MOST_KEYFRAMES:
-            self.keyframes.append(self._last)
+        if more > 0 and self.last is not None and len(self.keyframes) < MOST_KEYFRAMES:
+            self.keyframes.append(self.last)
         elif more < 0:
             del self.keyframes[-1:]
         self.set_text("keyframes", str(len(self.keyframes) or "none"))
@@ -270,7 +260,7 @@ class Page:
 
     def wanted(self, now: float) -> tuple[Wanted, bool] | None:
         """What the page wants, and whether something moves; None before the browser has a camera that can be one."""
-        seen = _seen_through(self.client.camera) or (None if self._last is None else self._last[:2])
+        seen = _seen_through(self.client.camera) or (None if self.last is None else self.last[:2])
         if seen is None:
             return None
         show = IMAGES.get(self.word("show", NO_IMAGE), "")
@@ -281,8 +271,8 @@ class Page:
         if show == "error" and at is None:
             show = "rgb"
         wanted = Wanted(*seen, instant, show, least, self.ticked("marked"), int(height), at, recorded)
-        if wanted != self._last:
-            self._last = wanted
+        if wanted != self.last:
+            self.last = wanted
             if self._played_at is None:
                 self.changed_at = now
         return wanted, self._played_at is not None or self._previewed is not None or now - self.changed_at < REST

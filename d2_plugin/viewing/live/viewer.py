@@ -2,9 +2,8 @@
 
     viewer = Viewer(d2)              # after D2Hooks: the page at viewer.url shows the model as it trains
 
-Images are drawn by the thread that trains, between two steps: nothing is locked, and no half-edited model is shown.
-Training is the same with and without: the viewer reads, draws nothing at random, and waits where somebody pauses. What
-goes wrong with one browser's page closes that page; the training goes on.
+Images are drawn by the thread that trains, between two steps: nothing is locked, no half-edited model is shown, and
+training is the same with and without. What goes wrong with one browser's page closes that page; the training goes on.
 """
 
 from __future__ import annotations

@@ -191,7 +191,7 @@ def compared(new_page: Any, tmp_path: Path) -> Page:
 
 
 def begun(page: Page) -> Page:
-    page.run("d2.then((player) => player.images)")
+    page.run("d2.then(() => 0)")
     drawn(page)
     return page
 

@@ -23,7 +23,6 @@ class Player {
     this.held = new Set();   // keys
     this.pace = new Pace();
     this.wanted = true;      // something changed since the last image
-    this.images = 0;         // drawn so far
     const code = new Blob([byId("worker").textContent], { type: "text/javascript" });
     this.worker = new Worker(URL.createObjectURL(code));
     this.worker.postMessage({ header, raw });
@@ -252,7 +251,6 @@ class Player {
     shown.forEach((place, i) => this.renderer.models[place].setOrder(orders[i]));
     this.renderer.draw(view, time, mode, sides);
     gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4));  // waits until it is drawn
-    this.images++;
     this.busy = false;
     if (this.waiting) this.waiting();
     else this.pace.note(view.size[0] * view.size[1], (performance.now() - start) / 1000, this.screenView(1).size);
