@@ -92,12 +92,16 @@ def encoded(values: Tensor, frequencies: int) -> Tensor:
 
 
 def screw_motions(turn: Tensor, shift: Tensor) -> Tensor:
-    """Rigid motions [N, 4, 4] of screws: the exponential of (turn, shift), each [N, 3]."""
-    twist = turn.new_zeros(len(turn), 4, 4)
-    # Columns are the products of the axis with the unit vectors.
-    twist[:, :3, :3] = torch.linalg.cross(turn[:, None], torch.eye(3).to(turn)[None]).mT
-    twist[:, :3, 3] = shift
-    return torch.linalg.matrix_exp(twist)
+    """Rigid motions [N, 4, 4] of screws: the exponential of (turn, shift), each [N, 3], with angle |turn|."""
+    angle = turn.norm(dim=-1, keepdim=True)
+    axis, along, angle = turn / angle + 1e-5, shift / angle + 1e-5, angle[..., None]  # as the repository has it
+    one, rest = torch.eye(3).to(axis), 1 - angle.cos()
+    K = torch.linalg.cross(axis[:, None], one[None]).mT  # its columns are the products with the unit vectors
+    rotation = one + angle.sin() * K + rest * (K @ K)
+    reach = angle * one + rest * K + (angle - angle.sin()) * (K @ K)
+    motion = torch.eye(4).to(axis).repeat(len(axis), 1, 1)
+    motion[:, :3] = torch.cat([rotation, reach @ along[..., None]], -1)
+    return motion
 
 
 class PlaneField:

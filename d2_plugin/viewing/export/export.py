@@ -119,5 +119,4 @@ def _convert(ply: Path, path: Path) -> None:
         raise D2Error(f"{CONVERTER} cannot write {path} ({done.stderr[-300:].strip()}): choose --format ply")
 
 
-FRAME_FORMATS = ("ply", "sog", "spz", "glb")
-"""Those of single instants."""
+FRAME_FORMATS = ("ply", "sog", "spz", "glb")  # of single instants

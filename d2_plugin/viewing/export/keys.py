@@ -2,8 +2,7 @@
 
 Nothing is known of the model but its Gaussians at an instant. Between two keys a Gaussian's centre, opacity and the
 Cholesky factor L of its covariance L L^T go straight: a mixture of factors is the factor of a covariance, and unlike
-rotations and scales it has no axes to confuse. There are as many keys as make it good enough. A
-Gaussian that never leaves its first key by more than `STILL` pixels has no keys.
+rotations and scales it has no axes to confuse. A Gaussian that never leaves its first key has no keys.
 """
 
 from __future__ import annotations

@@ -34,8 +34,7 @@ PAGE_SCRIPTS = ("controls.js", "scene.js", "shaders.js", "renderer.js", "pace.js
 WORKER_SCRIPTS = ("scene.js", "sorter.js")
 RECORDED_BYTES, RECORDED_HEIGHT, RECORDED_QUALITY = 2.5e6, 360, 80
 """Of the recorded images in a page: all together, at most so many pixels high, quality of WebP."""
-CONTROLS_HEIGHT = 50
-"""Pixels below the image."""
+CONTROLS_HEIGHT = 50  # pixels below the image
 
 
 def _placed(data: bytearray, part: bytes) -> int:

@@ -24,8 +24,8 @@ SAVED = 0.5
 
 
 class Resolution:
-    """Learns what an image costs however small (many Gaussians) and what a pixel costs, so that a moving image is as
-    large as fits its time: a straight line through the last measurements. player/pace.js does the same."""
+    """What an image costs however small and what a pixel costs: a straight line through the last measurements. With it
+    a moving image is as large as fits its time. player/pace.js does the same."""
 
     def __init__(self) -> None:
         self._sums = np.array([1e-6, 1e-1, 1e-8, 1e4, 1e-3])
