@@ -370,3 +370,12 @@ def test_a_page_whose_data_is_damaged_says_so(new_page: Any, tmp_path: Path) -> 
     page = new_page().open(path)
     page.page.wait_for_function("!document.getElementById('message').textContent.startsWith('reading')")
     assert page.page.locator("#message").is_visible()
+
+
+def test_what_the_page_says_of_itself_is_not_under_the_other_controls(compared: Page) -> None:
+    compared.page.locator("#more").click()
+    compared.page.locator("#about").click()
+    assert compared.page.locator("#notes").is_visible()
+    assert compared.page.locator("#rest").is_hidden()
+    assert compared.page.locator("#about").get_attribute("aria-expanded") == "true"
+    assert "12 recorded images of the cameras right" in compared.page.locator("#facts").inner_text()

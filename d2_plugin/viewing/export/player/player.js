@@ -71,10 +71,10 @@ class Player {
       link: () => this.share(),
       save: () => this.save(),
       full: () => (document.fullscreenElement ? document.exitFullscreen() : document.documentElement.requestFullscreen()),
-      about: () => { byId("notes").hidden = !byId("notes").hidden; pressed("about", !byId("notes").hidden); },
-      more: () => pressed("more", byId("rest").classList.toggle("open")),
+      about: () => { pressed("about", !(byId("notes").hidden = !byId("notes").hidden)); this.acts.more(false); },
+      more: (on) => pressed("more", byId("rest").classList.toggle("open", on)),
     };
-    for (const [id, act] of Object.entries(this.acts)) on(id, "click", act);
+    for (const [id, act] of Object.entries(this.acts)) on(id, "click", () => act());
     listen(byId("image"), this.camera, () => { this.swing(false); this.change(); });
     on("time", "input", () => { this.play(false); this.goTo(Number(byId("time").value)); });
     on("mode", "change", () => this.setMode(byId("mode").value));
