@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import signal
 import sys
 import threading
@@ -30,14 +31,18 @@ def import_pycolmap(purpose: str, extra: str) -> ModuleType:
     return pycolmap
 
 
-def import_av(purpose: str) -> ModuleType:
-    """The module av (PyAV, FFmpeg); `purpose` completes the sentence "<purpose> needs PyAV".
+def imported(name: str, package: str, extra: str, purpose: str) -> ModuleType:
+    """The module `name` of a package; `purpose` completes the sentence "<purpose> needs <package>".
 
     Raises:
-        MissingExtra: where it is not installed.
+        MissingExtra: where it is not installed; the sentence names `extra`, the extra of this package that brings it.
     """
     try:
-        import av
+        return importlib.import_module(name)
     except ImportError:
-        raise missing_extra("PyAV", "video", purpose) from None
-    return av
+        raise missing_extra(package, extra, purpose) from None
+
+
+def import_av(purpose: str) -> ModuleType:
+    """The module av (PyAV, FFmpeg), see `imported`."""
+    return imported("av", "PyAV", "video", purpose)

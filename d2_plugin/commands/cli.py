@@ -38,7 +38,7 @@ COMMANDS: dict[str, str | ModuleCommand] = {
         "A page in the browser that shows a run, a recording or a depth prior, in space and time.",
     ),
     "compare": ModuleCommand(
-        "d2_plugin.commands.compare", "Comparison", "One Markdown table of the scores of several runs."
+        "d2_plugin.commands.compare", "Comparison", "One Markdown table of the scores of several runs; a page of two."
     ),
     "ablate": "ablate",
     "bench": "bench",

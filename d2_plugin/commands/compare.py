@@ -1,4 +1,4 @@
-"""One Markdown table of the scores of several runs."""
+"""One Markdown table of the scores of several runs, and a page that shows two of them beside each other."""
 
 from __future__ import annotations
 
@@ -15,11 +15,21 @@ class Comparison(Settings):
 
     run_folders: Annotated[tuple[Path, ...], Positional()]
     """The --output folders of `d2 train`."""
+    page: Path | None = None
+    """HTML file to write: two runs and the recording beside each other, as `d2 export A B` writes it."""
 
 
 def run(settings: Comparison) -> str:
-    """The table."""
+    """The table, and where the page is."""
     from d2_plugin.runs.saved import read_metrics
     from d2_plugin.runs.tables import metrics_table
 
-    return metrics_table({folder.name: read_metrics(folder) for folder in settings.run_folders})
+    table = metrics_table({folder.name: read_metrics(folder) for folder in settings.run_folders})
+    if settings.page is None:
+        return table
+    from d2_plugin.viewing.export.page import write_page
+    from d2_plugin.viewing.export.scene import export_scene
+    from d2_plugin.viewing.viewed import viewed_run
+
+    write_page([export_scene(viewed_run(folder)) for folder in settings.run_folders], settings.page)
+    return f"{table}\nPage: {settings.page}"

@@ -25,6 +25,7 @@ OPTIONAL = {
     "kornia": ("test", "image operations that tests compare with"),
     "av": ("video", "the import of videos, and videos of a run"),
     "viser": ("view", "the page that shows a run, and one that trains"),
+    "fourdgs": ("formats", "exports as .4dgs"),
     "rich": ("cli", "progress bars"),
     "distributed": ("cluster", "priors built by several processes or machines"),
 }

@@ -1,4 +1,8 @@
-"""Score the held-out cameras of a trained run again."""
+"""Score the held-out cameras of a trained run again.
+
+LPIPS is measured once `pip install lpips` and, with a network, `python -c "import lpips; lpips.LPIPS(net='alex')"` have
+brought its weights; FLIP once `pip install flip-evaluator` was run.
+"""
 
 from __future__ import annotations
 

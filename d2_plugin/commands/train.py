@@ -105,8 +105,8 @@ def _refuse_videos(path: Path) -> None:
 
 def _live(run: Run) -> LiveRun:
     """The page of a run; its package is asked for before anything is computed."""
-    from d2_plugin.viewing.live.server import viser
+    from d2_plugin.extras import imported
     from d2_plugin.viewing.live.show import LiveRun
 
-    viser()
+    imported("viser", "viser", "view", "the live viewer")
     return LiveRun(run)

@@ -11,6 +11,7 @@ two definitions.
 
 from __future__ import annotations
 
+import importlib.util
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -100,6 +101,16 @@ def ssim_3dgs(image: Tensor, truth: Tensor) -> float:
     taps = [weight / sum(weights) for weight in weights]
     first, second = (np.pad(image, ((0, 0), (reach, reach), (reach, reach))) for image in pair)
     return _ssim(first, second, taps, data_range=1.0, unbias=1.0)
+
+
+def flip(image: Tensor, truth: Tensor) -> float | None:
+    """FLIP of Andersson et al. 2020, 0..1, 0 for equal images: what an eye sees that flips from one to the other on a
+    screen of 67 pixels per degree. By NVIDIA's package flip-evaluator; None where it is not installed."""
+    if importlib.util.find_spec("flip_evaluator") is None:
+        return None
+    package = importlib.import_module("flip_evaluator")
+    first, second = (np.ascontiguousarray(part.transpose(1, 2, 0), np.float32) for part in _pair(truth, image))
+    return float(package.evaluate(first, second, "LDR", applyMagma=False)[1])
 
 
 def flicker(image: Tensor, truth: Tensor, image_before: Tensor, truth_before: Tensor) -> float:
@@ -278,6 +289,10 @@ METRICS = {
     "lpips_vgg": Metric(
         "version 0.1 on VGG16, images in 0..1 unmapped (lpipsPyTorch, as 3DGS codebases)",
         lambda c: c.by_network("lpips_vgg"),
+    ),
+    "flip": Metric(
+        "LDR-FLIP at 67 pixels per degree, mean over the image (flip-evaluator), where that is installed",
+        lambda c: flip(c.image, c.truth),
     ),
     "flicker": Metric(
         "mean |(I_t - I_s) - (T_t - T_s)| of render I and truth T, s the frame compared before t (this project)",

@@ -61,6 +61,7 @@ COLUMNS = (
     Column("SSIM2", "ssim2", ".4f", True),
     Column("LPIPS", "lpips", ".4f", False),
     Column("LPIPS vgg", "lpips_vgg", ".4f", False, always=False),
+    Column("FLIP", "flip", ".4f", False, always=False),
     Column("SSIM 3DGS", "ssim_3dgs", ".4f", True, always=False),
     Column("flicker", "flicker", ".4f", False, always=False),
     Column("depth AbsRel", "depth_absrel", ".4f", False),

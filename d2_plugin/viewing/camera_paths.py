@@ -1,12 +1,10 @@
 """Camera paths: a camera for each image of a video, made from the cameras of a recording or read.
 
-All poses are `T_camera_world` [4, 4] float64 in OpenCV axes. Two to four cameras cover a small part of the sphere
-around a scene, and what they did not see cannot be shown: orbit and spiral stay inside the angle that they span.
+All poses are `T_camera_world` [4, 4] float64 in OpenCV axes. What few cameras did not see cannot be shown: an orbit
+stays inside the angle that they span.
 
-`read_camera_path` reads nerfstudio's camera_path.json, as its viewer and others write it. There poses are
-camera-to-world in OpenGL axes (x right, y up, z back), the field of view is vertical and in degrees. The path must be
-in the world of the recording: a `dataparser_transforms.json` beside it, with which nerfstudio turned and scaled that
-world, is undone.
+nerfstudio's camera_path.json has poses camera-to-world in OpenGL axes (x right, y up, z back), and vertical fields of
+view in degrees. A `dataparser_transforms.json` beside it, which turned and scaled the recording's world, is undone.
 """
 
 from __future__ import annotations
@@ -19,7 +17,7 @@ from typing import Annotated, Any, NamedTuple, Optional
 import numpy as np
 
 from d2_plugin.errors import D2Error
-from d2_plugin.reading import NoSuchFile, field, read_json
+from d2_plugin.reading import NoSuchFile, field, json_text, read_json
 from d2_plugin.recordings import Camera
 from d2_plugin.recordings.cameras.camera import (
     LARGEST_NUMBER,
@@ -36,6 +34,10 @@ ALL_AROUND = 270.0
 """Cameras that span more than this many degrees stand all around: an orbit is then a whole turn."""
 LEAST_SWING = 12.0
 """Degrees that an orbit swings at least, where cameras stand close together."""
+MARGIN = 10.0
+"""Degrees that a free camera may go beyond where cameras stood."""
+NEAREST, FARTHEST = 0.35, 1.25
+"""How near and how far it may go, relative to the nearest and the farthest camera."""
 
 EXPORT = "export the camera path again"
 
@@ -69,7 +71,7 @@ def orbit(
     It swings by `degrees`, by default the angle that the cameras span, or a whole turn where they stand all around.
     `depth` is that of what is looked at, in front of the cameras, where their axes do not meet.
     """
-    rig = _Rig.of(cameras, depth)
+    rig = Rig.of(cameras, depth)
     span = rig.span if degrees is None else degrees
     if degrees is None:
         span = 360.0 if span > ALL_AROUND else max(span, LEAST_SWING)
@@ -80,22 +82,6 @@ def orbit(
     return [at_pose(cameras[0], look_at(rig.focus + offset, rig.focus, rig.up)) for offset in around]
 
 
-def spiral(cameras: Sequence[Camera], count: int, depth: float | None = None) -> list[Camera]:
-    """LLFF's spiral of two turns about the mean camera, looking at the point that the cameras look at.
-
-    Its radii are half of the 90th percentile of the cameras' distances from their mean, along each axis: the whole
-    of it would leave what an arc of few cameras has seen.
-    """
-    rig = _Rig.of(cameras, depth)
-    axes = look_at(rig.middle, rig.focus, rig.up)[:3, :3]
-    offsets = np.abs((np.stack([camera.centre for camera in cameras]) - rig.middle) @ axes.T)
-    radii = 0.5 * np.percentile(offsets, 90, axis=0)
-    radii = np.maximum(radii, 0.02 * np.linalg.norm(rig.focus - rig.middle) * np.array([1, 1, 0]))
-    angle = 4 * np.pi * np.arange(count) / max(count, 1)
-    local = np.stack([np.sin(angle), np.cos(angle) - 1, np.sin(angle / 2)], -1) * radii
-    return [at_pose(cameras[0], look_at(rig.middle + offset @ axes, rig.focus, rig.up)) for offset in local]
-
-
 def through(cameras: Sequence[Camera], count: int) -> list[Camera]:
     """From camera to camera, each the nearest that is left: the first pose is the first camera, the last the last.
 
@@ -103,7 +89,7 @@ def through(cameras: Sequence[Camera], count: int) -> list[Camera]:
     """
     chain = _chained(cameras)
     places = np.linspace(0, len(chain) - 1, count) if count > 1 else np.zeros(1)
-    return [_between(chain, place) for place in places]
+    return [between(chain, place) for place in places]
 
 
 def look_at(position: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
@@ -117,8 +103,8 @@ def look_at(position: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndar
     return rigid(R, -R @ position)
 
 
-class _Rig(NamedTuple):
-    """What the cameras have in common."""
+class Rig(NamedTuple):
+    """What cameras have in common."""
 
     focus: np.ndarray  # [3], what they look at
     middle: np.ndarray  # [3], where a camera between them stands
@@ -126,7 +112,8 @@ class _Rig(NamedTuple):
     span: float  # degrees
 
     @classmethod
-    def of(cls, cameras: Sequence[Camera], depth: float | None) -> _Rig:
+    def of(cls, cameras: Sequence[Camera], depth: float | None) -> Rig:
+        """Of one camera or more; `depth` is that of what they look at, where their axes do not meet."""
         centres = np.stack([camera.centre for camera in cameras])
         forwards = np.stack([camera.T_camera_world[2, :3] for camera in cameras])
         up = _unit(-np.mean([camera.T_camera_world[1, :3] for camera in cameras], axis=0))
@@ -137,6 +124,26 @@ class _Rig(NamedTuple):
         radius, height = np.linalg.norm(flat, axis=1).mean(), (offsets @ up).mean()
         towards = rotation_of_vector(np.radians(azimuth) * up) @ _unit(flat[0])
         return cls(focus, focus + radius * towards + height * up, up, span)
+
+    @property
+    def home(self) -> np.ndarray:
+        """T_camera_world [4, 4] in front of what the cameras look at, between them."""
+        return look_at(self.middle, self.focus, self.up)
+
+    def limits(self, cameras: Sequence[Camera]) -> dict[str, list[float] | None]:
+        """Ends of where cameras stood, with a margin: azimuth about `up` (radians, 0 at home; None where they stand all
+        around), elevation (radians) and distance from the focus."""
+        offsets, home = np.stack([camera.centre for camera in cameras]) - self.focus, self.middle - self.focus
+        ahead = _unit(home - (home @ self.up) * self.up)
+        azimuth = np.arctan2(offsets @ np.cross(self.up, ahead), offsets @ ahead)
+        distance = np.linalg.norm(offsets, axis=1)
+        elevation = np.arcsin(np.clip(offsets @ self.up / distance, -1, 1))
+        margin = np.radians([-MARGIN, MARGIN])
+        return {
+            "azimuth": None if self.span > ALL_AROUND else ([azimuth.min(), azimuth.max()] + margin).tolist(),
+            "elevation": np.clip([elevation.min(), elevation.max()] + margin, -1.5, 1.5).tolist(),
+            "distance": [NEAREST * float(distance.min()), FARTHEST * float(distance.max())],
+        }
 
 
 def focus_of(centres: np.ndarray, forwards: np.ndarray, depth: float | None = None) -> np.ndarray:
@@ -178,7 +185,7 @@ def _chained(cameras: Sequence[Camera]) -> list[Camera]:
     return [cameras[i] for i in order]
 
 
-def _between(chain: Sequence[Camera], place: float) -> Camera:
+def between(chain: Sequence[Camera], place: float) -> Camera:
     """The pose at `place` of a chain: whole numbers are its cameras."""
     first = min(int(place), len(chain) - 1)
     share = place - first
@@ -217,7 +224,7 @@ def read_camera_path(path: Path) -> CameraPath:
     try:
         table = read_json(path, EXPORT)
     except NoSuchFile:
-        raise D2Error(f"no camera path at {path}: give orbit, spiral, through, held-out, training or a file") from None
+        raise D2Error(f"no camera path at {path}: give orbit, through, held-out, training or a file") from None
     kind, place = table.get("camera_type", "perspective"), str(path)
     if kind != "perspective":
         raise D2Error(f"{path} is for a camera of type {str(kind)[:40]!r}, expected perspective: export it as that")
@@ -240,11 +247,22 @@ def read_camera_path(path: Path) -> CameraPath:
         cameras.append(replace(checked_camera(str(number), size, K, pose, None, place), name=""))
         times.append(field(entry, "render_time", OptionalTime, where, EXPORT, default=None))
     known = [float(np.clip(time, 0, 1)) for time in times if time is not None]
-    if table.get("fps"):
-        fps = field(table, "fps", Above0, place, EXPORT)
-    else:
+    if table.get("seconds") or not table.get("fps"):  # as nerfstudio's renderer has it
         fps = len(cameras) / (field(table, "seconds", Above0, place, EXPORT) if table.get("seconds") else 1.0)
+    else:
+        fps = field(table, "fps", Above0, place, EXPORT)
     return CameraPath(cameras, known if len(known) == len(times) else None, fps)
+
+
+def camera_path_text(cameras: Sequence[Camera], shares: Sequence[float], fps: float) -> str:
+    """nerfstudio's camera_path.json of cameras of one size in the world of the recording; see `CameraPath`."""
+    entries = []
+    for camera, share in zip(cameras, shares, strict=True):
+        world = np.linalg.inv(camera.T_camera_world) @ OPENGL_TO_OPENCV
+        fov = float(np.degrees(2 * np.arctan(camera.height / 2 / camera.K[1, 1])))
+        entries.append({"camera_to_world": world.flatten().tolist(), "fov": fov, "render_time": share})
+    size = {"render_width": cameras[0].width, "render_height": cameras[0].height} if cameras else {}
+    return json_text(size | {"fps": fps, "seconds": len(entries) / fps, "camera_path": entries}, "the camera path")
 
 
 def _dataparser(path: Path) -> tuple[np.ndarray, float]:

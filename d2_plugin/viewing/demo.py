@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -25,9 +25,6 @@ from d2_plugin.viewing.viewed import viewed_run
 
 VARIANTS = {"backbone": (), "backbone + D2": HOOK_NAMES}
 """Name -> hooks."""
-
-PLAYED = "backbone + D2"
-"""The variant that the demo's player shows."""
 
 
 @dataclass(frozen=True)
@@ -67,10 +64,10 @@ def run(settings: Demo) -> str:
     _compare({name: run.folder for name, run in runs.items()}, held_out[len(held_out) // 2], image)
     table = metrics_table(scores)
     page = folder / "player.html"
-    write_page(export_scene(viewed_run(runs[PLAYED].folder)), page)
+    write_page([export_scene(replace(viewed_run(run.folder), name=name)) for name, run in runs.items()], page)
     return (
         f"{table}\nThe recording is rendered and its monocular depth is emulated.\nImage: {image}\n"
-        f"Player: {page} (open it in a browser; it plays '{PLAYED}' without a network)"
+        f"Player: {page} (open it in a browser; it compares both with the recording, without a network)"
     )
 
 

@@ -13,13 +13,11 @@ from d2_plugin.errors import D2Error
 from d2_plugin.priors.sheet import LABEL_COLORS, SURE, UNSURE, label_colors, sigma_colors
 from d2_plugin.protocol import DepthPrior, Label, View
 from d2_plugin.recordings.images import opencv
-from d2_plugin.runs.drawing import Panel, Scale, as_bytes, color_scale, colorize, depth_panel, error_panel
-from d2_plugin.viewing.rendering import RenderedView, gaussians_per_pixel, render_view
+from d2_plugin.runs.drawing import Panel, Scale, as_bytes, colorize, depth_panel, error_panel
+from d2_plugin.viewing.rendering import RenderedView, render_view
 from d2_plugin.viewing.viewed import ViewedRun
 
 GREYS = np.arange(256, dtype=np.uint8)[:, None].repeat(3, 1)
-MOST_GAUSSIANS = 200.0
-"""Gaussians per pixel at the bright end of their scale, which is logarithmic."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,13 +67,6 @@ def error(shot: Shot) -> Panel:
     return error_panel(difference, f"  {-10 * np.log10(noise):.1f} dB" if noise > 0 else "")
 
 
-def count(shot: Shot) -> Panel:
-    """Gaussians per pixel."""
-    number = gaussians_per_pixel(shot.rendered.splats, shot.view, shot.viewed.backbone.settings).numpy()
-    scale, most = color_scale("inferno"), float(np.log1p(MOST_GAUSSIANS))
-    return Panel(f"Gaussians 0..{MOST_GAUSSIANS:g} (log)", colorize(np.log1p(number), 0, most, scale), scale)
-
-
 def sigma(shot: Shot) -> Panel:
     """How wrong the prior says it may be."""
     image = _of_prior(shot, prior_sigma_colors)
@@ -96,7 +87,6 @@ KINDS: dict[str, Callable[[Shot], Panel]] = {
     "rgb": lambda shot: Panel("render", as_bytes(shot.rendered.color.numpy())),
     "depth": lambda shot: depth_panel("depth", shot.rendered.depth.numpy(), shot.depths),
     "alpha": lambda shot: Panel("alpha 0..1", colorize(shot.rendered.alpha.numpy(), 0, 1, GREYS), GREYS),
-    "count": count,
     "truth": lambda shot: Panel("recorded", shot.truth),
     "error": error,
     "true-depth": true_depth,

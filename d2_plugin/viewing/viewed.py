@@ -1,14 +1,10 @@
-"""What is looked at: Gaussians with the recording they belong to, its cameras and its depth prior.
-
-It comes from the folder of a run, a run that trains, the views of any trainer, a recording or a prior store.
-"""
+"""What is looked at: Gaussians with the recording they belong to, its cameras and its depth prior."""
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +18,7 @@ from d2_plugin.gaussians.moving import Harmonics, MovingGaussians
 from d2_plugin.protocol import View
 from d2_plugin.recordings import Camera, Recording, Source
 from d2_plugin.runs.run import Run
-from d2_plugin.runs.saved import load_checkpoint
+from d2_plugin.runs.saved import load_checkpoint, read_metrics
 from d2_plugin.runs.start import TimedPoints
 from d2_plugin.store.store import PriorStore
 from d2_plugin.viewing.camera_paths import for_size
@@ -47,6 +43,8 @@ class ViewedRun:
     points: np.ndarray | None = None
     """Triangulated surface points [P, 3]."""
     device: str = "cpu"
+    scores: Mapping[str, float] = field(default_factory=dict)
+    """PSNR of each scored camera, and under "" that of all held-out ones, as far as it is known."""
     note: str = ""
     """What a person should know about it, in one sentence."""
     time_scale: float = 1.0
@@ -102,7 +100,10 @@ def viewed_run(folder: Path) -> ViewedRun:
     hooks = (load_checkpoint(folder / "checkpoint.pt", "cpu") or {}).get("d2") or {}
     note = "" if trained.step >= total else f"{folder.name} still trains: this is step {trained.step} of {total}"
     adapter: Any = registry.load(registry.ADAPTERS, run.settings.backbone)
-    return replace(_of_run(run, adapter(trained.model), hooks.get("inserted_at")), note=note)
+    scores: dict[str, float] = {}
+    if (folder / "metrics.json").is_file() and (table := read_metrics(folder))["test"] is not None:
+        scores = {"": table["test"]["psnr"]} | {row["camera"]: row["psnr"] for row in table["per_camera"]}
+    return replace(_of_run(run, adapter(trained.model), hooks.get("inserted_at")), note=note, scores=scores)
 
 
 def viewed_training(run: Run, trainer: Any) -> ViewedRun:
@@ -140,26 +141,6 @@ def viewed_recording(recording: Recording, priors: Path | None = None) -> Viewed
             "give the recording that they were built for"
         )
     return ViewedRun(recording.name, recording, store.cameras, store=store)
-
-
-def viewed_store(store: PriorStore, fps: float = 30.0) -> ViewedRun:
-    """The cameras that a prior was built for, with the images that it kept.
-
-    Raises:
-        D2Error: the store is empty, or does not say where its cameras stood.
-    """
-    cameras: dict[str, Camera] = {}
-    for name, frame in itertools.product(store.cameras, store.frames):
-        if name in cameras:
-            continue
-        record, prior = store.camera(name, frame), store.prior(name, frame)
-        if record is not None and prior is not None:
-            height, width = prior.depth.shape
-            cameras[name] = Camera(name, width, height, record.K.numpy(), record.T_camera_world.numpy())
-    if not cameras:
-        raise D2Error(f"{store.path} has no prior that says where its camera stood: give --recording, or build it anew")
-    recording = Recording(store.path.name, cameras, store.frames, fps, KeptImages(cameras, store))
-    return ViewedRun(store.path.name, recording, tuple(cameras), store=store)
 
 
 def viewed_views(views: Sequence[View], backbone: Any, store: Any, name: str) -> ViewedRun:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import doctest
+import importlib.util
 import math
 from collections.abc import Callable
 
@@ -94,6 +95,17 @@ def test_images_of_two_sizes_are_refused() -> None:
         metrics.psnr(torch.rand(3, 8, 8), torch.rand(3, 8, 8))
     with pytest.raises(D2Error, match="differ: compare equal sizes"):
         metrics.depth_absrel(torch.rand(8, 8), torch.rand(4, 4))
+
+
+def test_flip_is_nvidias_own_and_without_its_package_it_is_not_measured(monkeypatch: pytest.MonkeyPatch) -> None:
+    a, b = tensors(sine_pair())
+    with monkeypatch.context() as patch:
+        patch.setattr(importlib.util, "find_spec", lambda name: None)
+        assert metrics.flip(a, b) is None
+    package = pytest.importorskip("flip_evaluator", reason="flip-evaluator is in the `flip` extra")
+    assert metrics.flip(a, a) == 0
+    assert metrics.flip(a, b) == pytest.approx(package.evaluate(b.numpy(), a.numpy(), "LDR")[1], abs=1e-6)
+    assert metrics.flip(a, b) > 0.05
 
 
 def test_flicker_is_blind_to_constant_errors_and_to_true_motion() -> None:

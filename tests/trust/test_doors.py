@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import gzip
 import os
 import signal
 import subprocess
@@ -15,7 +14,6 @@ from pathlib import Path
 
 import command_lines
 import pytest
-import torch
 from small_layouts import write_layout
 
 from d2_plugin.cache import Untrusted, cache_folder, check_private
@@ -23,13 +21,10 @@ from d2_plugin.commands import cli
 from d2_plugin.commands.cli import main
 from d2_plugin.durable import refuse_foreign
 from d2_plugin.errors import D2Error
-from d2_plugin.gaussians.moving import Harmonics, MovingGaussians
 from d2_plugin.reading import Unreadable, parse_json, parse_toml
 from d2_plugin.recordings.cameras.formats.document import Document
 from d2_plugin.recordings.importing.settings import by_camera, finite
 from d2_plugin.recordings.importing.video import videos_below
-from d2_plugin.viewing.export.ply import scales_and_rotations
-from d2_plugin.viewing.export.spz import write_spz
 
 pytest.importorskip("cv2", reason="opencv is in the `image` extra")
 
@@ -237,14 +232,3 @@ def test_a_database_of_colmap_that_cannot_be_written_is_one_sentence(monkeypatch
     images = [room.image(name, 0) for name in room.cameras]
     with pytest.raises(D2Error, match="COLMAP cannot triangulate in .* TMPDIR"):
         points.triangulate(images, list(room.cameras.values()))
-
-
-def test_an_opaque_gaussian_of_spz_has_a_finite_logit(tmp_path: Path) -> None:
-    still = MovingGaussians(
-        torch.zeros(1, 3, dtype=torch.float64),
-        torch.tensor([[1.0, 0, 0, 1, 0, 1]], dtype=torch.float64),
-        torch.ones(1, dtype=torch.float64),
-        Harmonics(torch.zeros(1, 1, 3, dtype=torch.float64), 0),
-    )
-    write_spz(tmp_path / "a.spz", still, scales_and_rotations(still.covariances))
-    assert gzip.decompress((tmp_path / "a.spz").read_bytes())[16 + 9] == 254, "behind header and position"

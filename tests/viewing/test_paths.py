@@ -16,12 +16,14 @@ from d2_plugin.recordings import Camera
 from d2_plugin.recordings.cameras.camera import OPENGL_TO_OPENCV
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.viewing.camera_paths import (
+    MARGIN,
+    Rig,
+    camera_path_text,
     focus_of,
     for_size,
     look_at,
     orbit,
     read_camera_path,
-    spiral,
     through,
 )
 
@@ -44,7 +46,7 @@ def is_rotation(R: np.ndarray) -> bool:
     return np.allclose(R @ R.T, np.eye(3), atol=1e-9) and np.linalg.det(R) > 0
 
 
-@pytest.mark.parametrize("path", [orbit, spiral, through])
+@pytest.mark.parametrize("path", [orbit, through])
 @pytest.mark.parametrize("cameras", [ARC, ARC[:2], ARC[:1], ring(8)], ids=["arc", "two", "one", "ring"])
 def test_every_pose_is_a_camera_pose(path, cameras: list[Camera]) -> None:
     poses = path(cameras, 17)
@@ -84,9 +86,16 @@ def test_cameras_all_around_are_orbited_by_a_whole_turn() -> None:
     assert np.linalg.norm(half.mean(axis=0)) > 1
 
 
-def test_a_spiral_stays_close_to_the_mean_camera() -> None:
-    middle, reach = np.mean([c.centre for c in ARC], axis=0), max(np.linalg.norm(c.centre - ARC[0].centre) for c in ARC)
-    assert max(np.linalg.norm(pose.centre - middle) for pose in spiral(ARC, 60)) < reach
+def test_home_and_the_limits_of_a_free_camera_follow_from_where_cameras_stood() -> None:
+    rig = Rig.of(ARC, None)
+    limits = rig.limits(ARC)
+    assert np.allclose((rig.home[:3, :3] @ rig.focus + rig.home[:3, 3])[:2], 0, atol=1e-9)
+    low, high = np.degrees(limits["azimuth"])
+    assert high - low == pytest.approx(rig.span + 2 * MARGIN, abs=0.1)
+    distances = [np.linalg.norm(camera.centre - rig.focus) for camera in ARC]
+    assert limits["distance"][0] < min(distances) <= max(distances) < limits["distance"][1]
+    assert limits["elevation"][0] < limits["elevation"][1]
+    assert Rig.of(ring(8), None).limits(ring(8))["azimuth"] is None
 
 
 def test_parallel_cameras_have_a_focus_in_front_of_them() -> None:
@@ -135,6 +144,19 @@ class TestCameraPathFiles:
         there = replace(ARC[1], T_camera_world=np.linalg.inv(moved))
         found = read_camera_path(self.write(tmp_path, there))
         assert np.allclose(found.cameras[0].T_camera_world, ARC[1].T_camera_world)
+
+    def test_a_path_that_is_written_is_read(self, tmp_path: Path) -> None:
+        path = tmp_path / "camera_path.json"
+        path.write_text(camera_path_text(ARC[:3], [0.0, 0.25, 1.0], 24))
+        found = read_camera_path(path)
+        assert (found.fps, found.shares) == (24, [0.0, 0.25, 1.0])
+        for camera, true in zip(found.cameras, ARC[:3], strict=True):
+            assert np.allclose(camera.T_camera_world, true.T_camera_world)
+            assert np.isclose(camera.K[1, 1], true.K[1, 1])
+
+    def test_it_lasts_as_long_as_it_says(self, tmp_path: Path) -> None:
+        assert read_camera_path(self.write(tmp_path, ARC[0], seconds=4.0)).fps == 0.5
+        assert read_camera_path(self.write(tmp_path, ARC[0])).fps == 24
 
     def test_times_count_only_where_all_have_one(self, tmp_path: Path) -> None:
         path = self.write(tmp_path, ARC[0])

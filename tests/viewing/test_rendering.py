@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 from mimics import deformable3d, fudan, spacetime
@@ -15,8 +14,7 @@ from d2_plugin.adapters.fudan import FudanAdapter
 from d2_plugin.adapters.gsplat_dict import GsplatAdapter
 from d2_plugin.adapters.spacetime import SpacetimeAdapter
 from d2_plugin.gaussians.spherical_harmonics import SH_C0
-from d2_plugin.protocol import RasterSettings, Splats
-from d2_plugin.viewing.rendering import MARKED, gaussians_per_pixel, render_view
+from d2_plugin.viewing.rendering import MARKED, render_view
 
 VIEW = make_views()[4]
 
@@ -111,29 +109,3 @@ def test_those_that_d2_inserted_are_pointed_out() -> None:
     assert torch.allclose(seen.color, seen.alpha[..., None] * torch.tensor(MARKED), atol=1e-4)
     faded = render_view(adapter, VIEW, marked=~marked).color
     assert torch.allclose(faded[..., 0], faded[..., 2], atol=1e-6)  # grey
-
-
-def test_the_number_of_gaussians_is_that_of_the_boxes_over_each_pixel() -> None:
-    generator = torch.Generator().manual_seed(2)
-    count, settings = 40, RasterSettings()
-    means = torch.rand(count, 3, generator=generator) * torch.tensor([3.0, 2, 3]) + torch.tensor([-1.5, -1, 0.1])
-    variances = 0.02 * torch.rand(count, 3, generator=generator) + 1e-4
-    covariances = torch.zeros(count, 6)
-    covariances[:, [0, 3, 5]] = variances
-    opacities = torch.rand(count, generator=generator)
-    found = gaussians_per_pixel(Splats(means, covariances, opacities, torch.arange(count)), VIEW, settings)
-    expected = np.zeros((VIEW.height, VIEW.width))
-    K, T = VIEW.K.numpy(), VIEW.T_camera_world.numpy()
-    for mean, variance, opacity in zip(means.numpy(), variances.numpy(), opacities.numpy(), strict=True):
-        x, y, z = T[:3, :3] @ mean + T[:3, 3]
-        if z <= settings.near or opacity < settings.alpha_min:
-            continue
-        J = np.array([[K[0, 0] / z, 0, -K[0, 0] * x / z**2], [0, K[1, 1] / z, -K[1, 1] * y / z**2]]) @ T[:3, :3]
-        C = J @ np.diag(variance) @ J.T + settings.blur * np.eye(2)
-        half = np.sqrt(2 * np.log(opacity / settings.alpha_min) * np.diag(C))
-        u, v = K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]
-        inside_x = np.abs(np.arange(VIEW.width) + 0.5 - u) <= half[0]
-        inside_y = np.abs(np.arange(VIEW.height) + 0.5 - v) <= half[1]
-        expected += inside_y[:, None] & inside_x[None]
-    assert expected.max() > 3
-    assert np.array_equal(found.numpy(), expected)

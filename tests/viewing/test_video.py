@@ -70,20 +70,13 @@ def test_every_image_comes_back_at_its_rate_odd_sides_gain_one_and_the_index_is_
     assert data.index(b"moov") < data.index(b"mdat"), "a browser can begin before it has the whole file"
 
 
-@pytest.mark.parametrize("form", ["webp", "gif"])
-def test_animated_images_keep_number_and_odd_size(tmp_path: Path, form: str) -> None:
-    path = tmp_path / f"video.{form}"
-    write(path, soft(5, 61, 43), 10, form)
-    if form == "webp":  # ffmpeg decodes no animated WebP: its frames are counted in the file
-        data = path.read_bytes()
-        assert (data[:4], data[8:12], data.count(b"ANMF")) == (b"RIFF", b"WEBP", 5)
-        at = data.index(b"VP8X") + 12
-        assert [int.from_bytes(data[at + i : at + i + 3], "little") for i in (0, 3)] == [60, 42]
-    else:
-        found = decoded(path)
-        assert len(found) == 5
-        assert found[0].shape == (43, 61, 3)
-        assert decibels(found[0], soft(5, 61, 43)[0]) > 25
+def test_an_animated_webp_keeps_number_and_odd_size(tmp_path: Path) -> None:
+    path = tmp_path / "video.webp"
+    write(path, soft(5, 61, 43), 10, "webp")
+    data = path.read_bytes()  # ffmpeg decodes no animated WebP: its frames are counted in the file
+    assert (data[:4], data[8:12], data.count(b"ANMF")) == (b"RIFF", b"WEBP", 5)
+    at = data.index(b"VP8X") + 12
+    assert [int.from_bytes(data[at + i : at + i + 3], "little") for i in (0, 3)] == [60, 42]
 
 
 def test_pngs_are_exact(tmp_path: Path) -> None:

@@ -25,13 +25,14 @@ from d2_plugin.errors import D2Error, MissingExtra
 from d2_plugin.runs.run import Run
 from d2_plugin.runs.settings import RunSettings
 from d2_plugin.viewing.live import Viewer
-from d2_plugin.viewing.live.images import Resolution
+from d2_plugin.viewing.live.images import Resolution, draw
 from d2_plugin.viewing.live.overlay import cloud_of
 from d2_plugin.viewing.live.page import Page, Wanted
 from d2_plugin.viewing.live.server import COOKIE, Access
 from d2_plugin.viewing.live.show import ViewSettings, address_line, viewed_at
 from d2_plugin.viewing.live.viewer import MOVED, WATCHED
-from d2_plugin.viewing.viewed import ViewedRun, viewed_store
+from d2_plugin.viewing.videos.plan import RenderSettings, plan_video
+from d2_plugin.viewing.viewed import ViewedRun, viewed_recording
 
 pytest.importorskip("viser", reason="viser is in the `view` extra")
 from websockets.datastructures import Headers
@@ -72,7 +73,7 @@ def looker(number: int = 1) -> Any:
     place = {"position": np.zeros(3), "wxyz": np.array([1.0, 0, 0, 0]), "fov": 0.8, "aspect": 4 / 3}
     camera = SimpleNamespace(**place, image_height=48, update_timestamp=1.0)
     camera.on_update = lambda react: None
-    return SimpleNamespace(client_id=number, gui=Gui(), scene=Scene(), camera=camera)
+    return SimpleNamespace(client_id=number, gui=Gui(), scene=Scene(), camera=camera, atomic=nullcontext)
 
 
 @pytest.fixture
@@ -213,6 +214,53 @@ def test_the_browsers_camera_becomes_the_view_of_the_same_camera(viewed: ViewedR
     assert np.allclose(np.diag(seen.K), np.diag(camera.K), rtol=1e-6)
 
 
+def test_at_a_camera_the_recorded_image_and_the_error_are_shown_and_elsewhere_not(viewed: ViewedRun) -> None:
+    client = looker()
+    page = Page(client, viewed, None, 54, lambda: None)
+    page.build()
+    page.stand_at("train1")
+    page.controls["recorded"].value = 1.0
+    wanted, _ = page.wanted(0.0)
+    assert wanted.standing == "train1"
+    truth = viewed.recording.image("train1", 0)
+    draw(page, wanted, None, None, Resolution())
+    image = client.scene.images[-1]  # 4:3 of a window, from the middle of 16:9
+    assert np.array_equal(image, truth[:, 12:-12])
+    page.controls["recorded"].value, page.controls["show"].value = 0.0, "error"
+    draw(page, page.wanted(0.0)[0], None, None, Resolution())
+    error = client.scene.images[-1]
+    assert not np.array_equal(error, image)
+    client.camera.position = client.camera.position + 0.1
+    wanted, _ = page.wanted(0.0)
+    assert (wanted.standing, wanted.show, wanted.recorded) == (None, "rgb", 0.0)
+
+
+def test_keyframes_become_a_path_that_d2_render_follows(viewed: ViewedRun, tmp_path: Path) -> None:
+    client, sent = looker(), []
+    client.send_file_download = lambda name, content, save_immediately: sent.append((name, content))
+    page = Page(client, viewed, None, 54, lambda: None)
+    page.build()
+    page._save()
+    assert not sent, "without a keyframe there is no path"
+    for name, time in (("train0", 0.0), ("train2", viewed.duration)):
+        page.stand_at(name)
+        page.controls["time"].value = time
+        page.wanted(0.0)
+        page._keep(1)
+    page._keep(1)
+    page._keep(-1)
+    page.controls["path_seconds"].value = 0.5
+    page._save()
+    [(name, content)] = sent
+    (tmp_path / name).write_bytes(content)
+    plan = plan_video(viewed, RenderSettings((), path=str(tmp_path / name)))
+    assert len(plan.stops) / plan.fps == pytest.approx(0.5)
+    ends = [plan.stops[0], plan.stops[-1]]
+    for stop, camera, time in zip(ends, ("train0", "train2"), (0.0, viewed.duration), strict=True):
+        assert np.allclose(stop.camera.T_camera_world, viewed.recording.cameras[camera].T_camera_world, atol=1e-6)
+        assert stop.time == pytest.approx(time)
+
+
 def test_the_prior_as_points_lies_where_its_pixels_say(viewed: ViewedRun) -> None:
     cloud = cloud_of(viewed, 0, "label", most=500)
     assert 50 < len(cloud.positions) <= 700
@@ -232,7 +280,7 @@ def test_controls_are_those_that_the_subject_has(viewed: ViewedRun) -> None:
     page.build()
     assert {"time", "show", "opacity", "marked", "cloud"} <= set(page.controls)
     assert "pause" not in page.controls
-    bare = Page(looker(), viewed_store(viewed.store), None, 360, lambda: None)
+    bare = Page(looker(), viewed_recording(viewed.recording, viewed.store.path), None, 360, lambda: None)
     bare.build()
     assert "show" not in bare.controls
     assert bare.word("cloud", "") == "image"
@@ -272,7 +320,7 @@ def damaged(client: Any, page: Page) -> list[Callable[[], object]]:
         *(control("opacity", opacity) for opacity in (nan, -1, 7, {})),
         *(control(name, word) for name in ("show", "speed", "cloud", "camera") for word in ("abc", None, 5, [], {})),
         *(control(name, value) for name in ("play", "marked", "frusta") for value in ("abc", nan, None)),
-        *(control(name, value) for name in ("point_size", "size_of_frusta") for value in (nan, "abc", -1)),
+        *(control(name, value) for name in ("recorded", "path_seconds") for value in (nan, "abc", -1, 1e300)),
     ]
 
 
@@ -351,11 +399,12 @@ class TestAccess:
 
 
 class TestSentences:
-    def test_what_cannot_be_shown(self, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def test_what_cannot_be_shown(self, room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         assert "is empty: give the folder of a run" in refused(capsys, "view", tmp_path)
         assert "no such recording" in refused(capsys, "view", tmp_path / "none")
         (tmp_path / "store.json").write_text('{"format": 1}')
-        assert "has format 1 but this version reads format" in refused(capsys, "view", tmp_path)
+        assert "lies in no folder of a run: name its recording" in refused(capsys, "view", tmp_path)
+        assert "has format 1 but this" in refused(capsys, "view", tmp_path, "--recording", room)
 
     def test_a_run_that_still_trains_an_empty_one_and_one_of_another_version(
         self, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]

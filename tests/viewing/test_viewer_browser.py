@@ -128,11 +128,11 @@ def test_a_person_moves_camera_and_time_while_another_only_looks(
 
 
 @pytest.mark.slow
-def test_depth_opacity_number_and_the_prior_as_points(new_page: Callable[[], Page], viewed: ViewedRun) -> None:
+def test_depth_opacity_and_the_prior_as_points(new_page: Callable[[], Page], viewed: ViewedRun) -> None:
     with showing(viewed) as viewer:
         page = opened(new_page, viewer)
         before = settled(page)
-        for show in ("depth", "opacity", "number of Gaussians"):
+        for show in ("depth", "opacity"):
             choose(page, "show", show)
             before = until(page, changed(before))
         choose(page, "show", "image")

@@ -24,19 +24,19 @@ def rotation_of_quaternion(quaternion: np.ndarray) -> np.ndarray:
 
 
 def quaternion_of_rotation(rotation: np.ndarray) -> np.ndarray:
-    """Unit quaternion [4], w first and not negative, of the rotation nearest to `rotation` [3, 3].
+    """Unit quaternions [..., 4], w first and not negative, of the rotations nearest to `rotation` [..., 3, 3].
 
     It is the leading eigenvector of a symmetric matrix (Bar-Itzhack 2000), which loses no digits at any angle.
     """
-    (a, b, c), (d, e, f), (g, h, i) = np.asarray(rotation, np.float64)
+    (a, b, c), (d, e, f), (g, h, i) = np.moveaxis(np.asarray(rotation, np.float64), (-2, -1), (0, 1))
     symmetric = [
         [a + e + i, h - f, c - g, d - b],
         [h - f, a - e - i, b + d, c + g],
         [c - g, b + d, e - a - i, f + h],
         [d - b, c + g, f + h, i - a - e],
     ]
-    quaternion = np.linalg.eigh(np.array(symmetric))[1][:, -1]
-    return quaternion if quaternion[0] >= 0 else -quaternion
+    quaternion = np.linalg.eigh(np.moveaxis(np.array(symmetric), (0, 1), (-2, -1)))[1][..., -1]
+    return np.where(quaternion[..., :1] >= 0, quaternion, -quaternion)
 
 
 def rotation_of_vector(vector: np.ndarray) -> np.ndarray:

@@ -7,8 +7,7 @@ the head of the centre is a screw motion.
 
 4DGaussians: a point (x, y, z, t) looks into six planes, one for each pair of its coordinates, on several levels; on a
 level the six features are multiplied, the levels stand beside each other. One hidden layer or more follows, and a head
-of two layers for each attribute that is deformed: offsets of raw positions, log scales, quaternions, opacity logits and
-harmonics.
+of two layers for each attribute that is deformed.
 """
 
 from __future__ import annotations
@@ -26,8 +25,6 @@ from d2_plugin.errors import D2Error
 
 TIME_FREQUENCIES = 10
 """Of the variant that does not encode time by layers, which alone says it by their widths."""
-AXIS_SHIFT = 1e-5
-"""Added to the entries of a screw axis by the repository, after the division by its length."""
 PAIRS = tuple(itertools.combinations(range(4), 2))
 """Of x, y, z, t: which two coordinates each plane of a level has."""
 HEADS = {
@@ -97,14 +94,13 @@ def encoded(values: Tensor, frequencies: int) -> Tensor:
 def screw_motions(turn: Tensor, shift: Tensor) -> Tensor:
     """Rigid motions [N, 4, 4] of screws: the exponential of (turn, shift), each [N, 3], with angle |turn|."""
     angle = turn.norm(dim=-1, keepdim=True)
-    axis, along = turn / angle + AXIS_SHIFT, shift / angle + AXIS_SHIFT
-    # Columns are the products of the axis with the unit vectors.
-    K = torch.linalg.cross(axis[:, None].expand(-1, 3, -1), torch.eye(3).to(axis).expand(len(axis), -1, -1)).mT
-    one, angle = torch.eye(3).to(axis), angle[..., None]
-    rotation = one + angle.sin() * K + (1 - angle.cos()) * (K @ K)
-    reach = angle * one + (1 - angle.cos()) * K + (angle - angle.sin()) * (K @ K)
+    axis, along, angle = turn / angle + 1e-5, shift / angle + 1e-5, angle[..., None]  # as the repository has it
+    one, rest = torch.eye(3).to(axis), 1 - angle.cos()
+    K = torch.linalg.cross(axis[:, None], one[None]).mT  # its columns are the products with the unit vectors
+    rotation = one + angle.sin() * K + rest * (K @ K)
+    reach = angle * one + rest * K + (angle - angle.sin()) * (K @ K)
     motion = torch.eye(4).to(axis).repeat(len(axis), 1, 1)
-    motion[:, :3, :3], motion[:, :3, 3:] = rotation, reach @ along[..., None]
+    motion[:, :3] = torch.cat([rotation, reach @ along[..., None]], -1)
     return motion
 
 

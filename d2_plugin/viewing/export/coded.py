@@ -1,9 +1,8 @@
 """The arrays of a page: a moving scene as numbers of 16 bits (or 8 and fewer) between the extremes of their block.
 
-Rows are coded in blocks of 256, each column with its own range in each block. Neighbours in space stand in one block
-(`morton_order`), so that the step is small, and a Gaussian far out costs precision in its own block only. An array is
-stored as ranges float32 [blocks, columns, 2], then per column the high bytes of all rows and then the low bytes: bytes
-of one kind beside each other are what a general compressor makes smaller. player/scene.js decodes.
+Rows are coded in blocks of 256 neighbours in space (`morton_order`), each column with its own range in each block, so
+that the step is small. An array is stored as ranges float32 [blocks, columns, 2], then per column the high bytes of all
+rows and then the low bytes, which compress better so. player/scene.js decodes.
 
 Every Gaussian has a position, a size and the six entries of its covariance's Cholesky factor relative to the size, an
 opacity and a colour. Beside those, straight lines have
@@ -15,11 +14,8 @@ costs no precision inside. Keys have positions, and shapes and opacities of the 
 
 from __future__ import annotations
 
-import gzip
 import math
-import zlib
-from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -32,13 +28,10 @@ from d2_plugin.viewing.export.ply import ALPHA_MIN
 
 BLOCK = 256
 """Rows that share their ranges."""
-COMPRESSION = 6
 MARGINAL_REACH = math.sqrt(-2 * math.log(MARGINAL_CUT))
 """Standard deviations from mu_t at which a Gaussian is cut off: F = `MARGINAL_CUT`."""
-HARMONIC_BITS = (8, 6, 5, 4, 3)
-"""Of all coefficients of a colour but the constant one: the first that fits."""
-SAMPLED = 16
-"""One block in so many is compressed to estimate the size of harmonics."""
+HARMONIC_BITS = 8
+"""Of all coefficients of a colour but the constant one."""
 
 
 class Coded(NamedTuple):
@@ -49,11 +42,11 @@ class Coded(NamedTuple):
     rows: int
     columns: int
     bits: int
-    decoded: Tensor | None = None
-    """[rows, columns] float64, the values that a reader finds, where they were asked for."""
+    decoded: Tensor
+    """[rows, columns] float64, the values that a reader finds."""
 
 
-def encode(name: str, values: np.ndarray, bits: int = 16, decode: bool = False) -> Coded:
+def encode(name: str, values: np.ndarray, bits: int = 16) -> Coded:
     """Code `values` [N, C] (or [N]), all finite, in 16 bits, or in at most 8 of a byte."""
     values = np.asarray(values, np.float64)
     values = values[:, None] if values.ndim == 1 else values
@@ -66,41 +59,24 @@ def encode(name: str, values: np.ndarray, bits: int = 16, decode: bool = False) 
     steps = (1 << bits) - 1
     share = (padded - low) / np.where(high > low, high - low, 1)
     codes = np.clip(np.rint(share * steps), 0, steps).astype(np.uint16)
-    decoded = (low + codes * ((high - low) / steps)).reshape(-1, columns)[:rows] if decode else None
+    decoded = (low + codes * ((high - low) / steps)).reshape(-1, columns)[:rows]
     planes = codes.reshape(blocks * BLOCK, columns)[:rows].T
     parts = [planes >> 8, planes & 255] if bits > 8 else [planes]
     body = np.stack(parts, axis=1).astype(np.uint8).tobytes()
-    return Coded(
-        name, ranges.tobytes() + body, rows, columns, bits, None if decoded is None else torch.from_numpy(decoded)
-    )
-
-
-def packed(arrays: Sequence[Coded]) -> tuple[list[dict[str, Any]], bytes]:
-    """A table of contents, and all arrays behind each other, compressed."""
-    contents, offset = [], 0
-    for array in arrays:
-        entry = {"name": array.name, "rows": array.rows, "columns": array.columns, "bits": array.bits}
-        contents.append(entry | {"offset": offset})
-        offset += len(array.data)
-    return contents, gzip.compress(b"".join(array.data for array in arrays), COMPRESSION, mtime=0)
+    return Coded(name, ranges.tobytes() + body, rows, columns, bits, torch.from_numpy(decoded))
 
 
 class CodedScene(NamedTuple):
     """Arrays and what a reader must know beside them."""
 
     arrays: list[Coded]
-    rows: Tensor
-    """Which of the model's Gaussians each one is."""
+    gaussians: int
     motion: Literal["none", "lines", "keys"]
-    harmonics: Harmonics
-    """The colours of these Gaussians, as they were before they were coded."""
     keys: Keys | None = None
 
 
-def code_lines(gaussians: MovingGaussians, duration: float, most_bytes: float = math.inf) -> CodedScene:
-    """Gaussians on straight lines, or standing still; those that are never seen in the clip are left out.
-
-    Harmonics are coded as coarsely as keeps all arrays, compressed, below `most_bytes`."""
+def code_lines(gaussians: MovingGaussians, duration: float) -> CodedScene:
+    """Gaussians on straight lines, or standing still; those that are never seen in the clip are left out."""
     rows = seen_rows(gaussians, duration)
     rows = rows[torch.from_numpy(morton_order(gaussians.positions[rows].numpy()))]
     chosen = gaussians.select(rows)
@@ -108,8 +84,7 @@ def code_lines(gaussians: MovingGaussians, duration: float, most_bytes: float = 
     positions = chosen.positions
     if chosen.motion is not None:
         velocities, times, sigmas = chosen.motion
-        fading = encode("fading", torch.stack([times, sigmas.log()], -1).numpy(), decode=True)
-        assert fading.decoded is not None
+        fading = encode("fading", torch.stack([times, sigmas.log()], -1).numpy())
         times, sigmas = fading.decoded[:, 0], fading.decoded[:, 1].exp()  # a reader's, so that their error does no harm
         # When each Gaussian is at its position, and how long it goes at most while it is seen.
         anchors, spans = times.clamp(0, duration), (MARGINAL_REACH * sigmas).clamp(max=duration)
@@ -117,9 +92,8 @@ def code_lines(gaussians: MovingGaussians, duration: float, most_bytes: float = 
         arrays += [fading, encode("reaches", (velocities * spans[:, None]).numpy())]
     state = State(positions, cholesky(chosen.covariances), chosen.opacities)
     arrays += _code_state(state)
-    left = most_bytes - sum(len(array.data) for array in arrays) - 6 * len(chosen)
-    arrays += _code_colors(chosen.harmonics, left)
-    return CodedScene(arrays, rows, "none" if chosen.motion is None else "lines", chosen.harmonics)
+    arrays += _code_colors(chosen.harmonics)
+    return CodedScene(arrays, len(rows), "none" if chosen.motion is None else "lines")
 
 
 def code_keys(keys: Keys, harmonics: Harmonics) -> CodedScene:
@@ -131,7 +105,7 @@ def code_keys(keys: Keys, harmonics: Harmonics) -> CodedScene:
         if keys.changing:
             arrays.append(encode(f"shapes_{i}", _shapes(state.factors)))
             arrays.append(encode(f"opacities_{i}", state.opacities.numpy()))
-    return CodedScene(arrays, keys.rows, "keys", own, keys)
+    return CodedScene(arrays, len(keys.rows), "keys", keys)
 
 
 def _shapes(factors: Tensor) -> np.ndarray:
@@ -161,24 +135,10 @@ def _code_state(state: State) -> list[Coded]:
     ]
 
 
-def _code_colors(harmonics: Harmonics, most_bytes: float = math.inf) -> list[Coded]:
-    """The constant colours, and the harmonics above them in at most `most_bytes` if need be."""
+def _code_colors(harmonics: Harmonics) -> list[Coded]:
+    """The constant colours, and the harmonics above them."""
     coefficients = harmonics.coefficients
     arrays = [encode("colors", coefficients[:, 0].numpy())]
     if coefficients.shape[1] > 1:
-        more = coefficients[:, 1:].flatten(1).numpy()
-        arrays.append(encode("harmonics", more, _bits_that_fit(more, most_bytes), decode=True))
+        arrays.append(encode("harmonics", coefficients[:, 1:].flatten(1).numpy(), HARMONIC_BITS))
     return arrays
-
-
-def _bits_that_fit(values: np.ndarray, most_bytes: float) -> int:
-    """By a sample of the blocks, compressed."""
-    blocks = np.arange(len(values)) // BLOCK
-    rows = blocks % SAMPLED == 0 if len(values) > 4 * SAMPLED * BLOCK else blocks >= 0
-    for bits in HARMONIC_BITS[:-1]:
-        if values.nbytes // 8 <= most_bytes:
-            return bits
-        size = len(zlib.compress(encode("sample", values[rows], bits).data, COMPRESSION))
-        if size * len(values) / rows.sum() <= most_bytes:
-            return bits
-    return HARMONIC_BITS[-1]

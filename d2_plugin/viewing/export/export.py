@@ -2,39 +2,42 @@
 
 from __future__ import annotations
 
+import shutil
+import subprocess
+import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from d2_plugin.durable import make_folder, refuse_foreign, remove_leftovers
+from d2_plugin.durable import make_folder, remove_leftovers
 from d2_plugin.errors import D2Error
 from d2_plugin.locks import only_writer
 from d2_plugin.progress import progress_bar
-from d2_plugin.settings import Count, Downscale, Positional, Range, Settings
+from d2_plugin.settings import Count, Downscale, Positional, Settings
 from d2_plugin.viewing.checkpoints import open_viewed
-from d2_plugin.viewing.export.coded import seen_rows
-from d2_plugin.viewing.export.page import GENERATOR, write_page
+from d2_plugin.viewing.export.fourdgs import write_4dgs
+from d2_plugin.viewing.export.page import write_page
 from d2_plugin.viewing.export.ply import write_ply
 from d2_plugin.viewing.export.scene import ExportScene, export_scene
-from d2_plugin.viewing.export.splatv import fit_curves, write_splatv
-from d2_plugin.viewing.export.spz import write_spz
+
+CONVERTER = "splat-transform"
+"""PlayCanvas's program, which reads and writes the formats of single instants."""
 
 
 @dataclass(frozen=True)
 class Export(Settings):
     """Which run is exported, as what."""
 
-    run_folder: Annotated[Path, Positional()]
-    """The --output of `d2 train`; or what an official trainer wrote, with --recording."""
-    format: Literal["html", "ply", "spz", "splatv"] = "html"
-    """html: one page that plays the scene without a network. ply, spz: a file for each frame. splatv: the moving scene
-    for splaTV and gsplat.js."""
+    runs: Annotated[tuple[Path, ...], Positional()]
+    """The --output of `d2 train`, of two runs for a page that compares; or what an official trainer wrote, with
+    --recording."""
+    format: Literal["html", "ply", "sog", "spz", "glb", "4dgs"] = "html"
+    """html: one page that plays the scene, or compares two, without a network. ply, sog, spz, glb (glTF): a file for
+    each frame. 4dgs: the moving scene."""
     output: Path | None = None
-    """Folder to write into; `export` inside the run's folder if not given."""
+    """Folder to write into; `export` inside the last run's folder if not given."""
     frames: tuple[Count, ...] | None = None
-    """first:last or first:last:step, the last one included, of ply and spz; all frames if not given."""
-    megabytes: Annotated[float, Range(1e-3, 1e6)] = 40.0
-    """Size of an html page that key times of a deformation field, or harmonics in 8 bits, may bring it to."""
+    """first:last or first:last:step, the last one included, of a file for each frame; all frames if not given."""
     recording: Path | None = None
     """The recording of a checkpoint of an official trainer."""
     train_cameras: tuple[str, ...] | None = None
@@ -51,68 +54,69 @@ def run(settings: Export) -> str:
     """Write the export; returns what was written, how large it is, and how far off."""
     if settings.frames is not None and settings.format not in FRAME_FORMATS:
         raise D2Error(
-            f"--frames is for {' and '.join(FRAME_FORMATS)}: {settings.format} holds the whole clip, leave it out"
+            f"--frames is for {', '.join(FRAME_FORMATS)}: {settings.format} holds the whole clip, leave it out"
         )
-    path = settings.run_folder
-    viewed = open_viewed(path, settings.recording, settings.train_cameras, settings.downscale)
+    if not 1 <= len(settings.runs) <= (2 if settings.format == "html" else 1):
+        raise D2Error(f"{len(settings.runs)} runs are given: give one, or for a page of html one or two")
+    checkpoint = settings.recording, settings.train_cameras, settings.downscale
+    shown, path = [open_viewed(path, *checkpoint) for path in settings.runs], settings.runs[-1]
     output = settings.output or (path.parent if path.is_file() else path) / "export"
-    paths, notes = write_export(export_scene(viewed), settings, output)
+    paths, notes = write_export([export_scene(viewed) for viewed in shown], settings, output)
     what = f"{len(paths)} files in {paths[0].parent}" if len(paths) > 1 else str(paths[0])
     size = sum(path.stat().st_size for path in paths) / 1e6
-    return "\n".join([f"{what} ({size:.1f} MB)", *([viewed.note] if viewed.note else []), *notes])
+    return "\n".join([f"{what} ({size:.1f} MB)", *(viewed.note for viewed in shown if viewed.note), *notes])
 
 
-def write_export(scene: ExportScene, settings: Export, folder: Path) -> Written:
-    """Write the scene under `folder` in the format that the settings name."""
+def write_export(scenes: list[ExportScene], settings: Export, folder: Path) -> Written:
+    """Write the scenes under `folder` in the format that the settings name."""
+    [*_, scene] = scenes
     with only_writer(make_folder(folder)):
         remove_leftovers(folder)
-        paths, notes = FORMATS[settings.format](scene, settings, folder)
-    if scene.background is not None and settings.format != "html":
+        if settings.format == "html":
+            return [folder / "scene.html"], write_page(scenes, folder / "scene.html")
+        if settings.format == "4dgs":
+            paths, notes = [folder / "scene.4dgs"], write_4dgs(scene, folder / "scene.4dgs")
+        else:
+            paths, notes = _frame_files(scene, settings, folder / settings.format), []
+    if scene.background is not None:
         notes = [*notes, "the background behind the Gaussians is left out: the format has no place for it, html has"]
     return paths, notes
 
 
-def _html(scene: ExportScene, settings: Export, folder: Path) -> Written:
-    path = folder / "scene.html"
-    refuse_foreign(path, f'content="{GENERATOR} ', "d2 export")
-    return [path], write_page(scene, path, settings.megabytes)
-
-
-def _splatv(scene: ExportScene, settings: Export, folder: Path) -> Written:
-    path, notes, bends = folder / "scene.splatv", [], None
-    if scene.moving is not None:
-        shown = scene.moving.select(seen_rows(scene.moving, scene.duration))
-    else:
-        shown, bends, offset = fit_curves(scene)
-        notes.append(f"one cubic curve for each Gaussian: off by {offset}")
-    write_splatv(path, shown, scene.duration, (*scene.train_cameras, *scene.test_cameras), bends)
-    if shown.harmonics.degree > 0:
-        notes.append("one colour for every direction: the format has no harmonics")
-    if shown.harmonics.time_degree:
-        notes.append("colours stand still, as they are at each Gaussian's mean time")
-    return [path], notes
-
-
-def _frame_files(scene: ExportScene, settings: Export, folder: Path) -> Written:
+def _frame_files(scene: ExportScene, settings: Export, folder: Path) -> list[Path]:
     """One file of Gaussians that stand still for each frame."""
-    chosen = scene.frames if settings.frames is None else settings.frames
+    chosen = scene.viewed.recording.frames if settings.frames is None else settings.frames
     for frame in chosen:
-        if frame not in scene.frames:
-            first, last = scene.frames[0], scene.frames[-1]
+        if frame not in scene.viewed.recording.frames:
+            first, last = scene.viewed.recording.frames[0], scene.viewed.recording.frames[-1]
             raise D2Error(f"the run has no frame {frame}: it has {first} to {last}; name some of those in --frames")
     if not chosen:
         raise D2Error("--frames names no frame: give first:last, or leave it out for all of them")
-    make_folder(folder / settings.format)
-    paths, writer = list[Path](), write_spz if settings.format == "spz" else write_ply
-    with progress_bar(settings.format, len(set(chosen))) as bar:
-        for frame, time in zip(scene.frames, scene.seconds):
+    make_folder(folder)
+    paths = list[Path]()
+    with progress_bar(settings.format, len(set(chosen))) as bar, tempfile.TemporaryDirectory() as between:
+        for frame, time in zip(scene.viewed.recording.frames, scene.seconds):
             if frame in chosen:
-                paths.append(folder / settings.format / f"frame_{frame:05d}.{settings.format}")
-                writer(paths[-1], *scene.still_at(time))
+                paths.append(folder / f"frame_{frame:05d}.{settings.format}")
+                ply = paths[-1] if settings.format == "ply" else Path(between) / "frame.ply"
+                write_ply(ply, *scene.still_at(time))
+                if ply != paths[-1]:
+                    _convert(ply, paths[-1])
                 bar.update(len(paths))
-    return paths, []
+    return paths
 
 
-FORMATS = {"html": _html, "ply": _frame_files, "spz": _frame_files, "splatv": _splatv}
-"""By the name of the format; a new one is a function here and a word in `Export.format`."""
-FRAME_FORMATS = ("ply", "spz")
+def _convert(ply: Path, path: Path) -> None:
+    """Let PlayCanvas's converter write a file of another format."""
+    program = shutil.which(CONVERTER)
+    if program is None:
+        raise D2Error(
+            f"{path.suffix[1:]} is written by {CONVERTER}, which is not installed: run `npm install -g "
+            f"@playcanvas/{CONVERTER}`, or choose --format ply"
+        )
+    done = subprocess.run([program, "-q", "-w", "-g", "cpu", str(ply), str(path)], capture_output=True, text=True)
+    if done.returncode or not path.is_file():
+        raise D2Error(f"{CONVERTER} cannot write {path} ({done.stderr[-300:].strip()}): choose --format ply")
+
+
+FRAME_FORMATS = ("ply", "sog", "spz", "glb")  # of single instants

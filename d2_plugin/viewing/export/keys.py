@@ -2,14 +2,12 @@
 
 Nothing is known of the model but its Gaussians at an instant. Between two keys a Gaussian's centre, opacity and the
 Cholesky factor L of its covariance L L^T go straight: a mixture of factors is the factor of a covariance, and unlike
-rotations and scales it has no axes to confuse. Keys are added where the straight line is worst, until it is good enough
-or the size is used up. A Gaussian that never leaves its first key by more than `STILL` pixels has no keys.
+rotations and scales it has no axes to confuse. A Gaussian that never leaves its first key has no keys.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -23,15 +21,9 @@ from d2_plugin.viewing.export.scene import ExportScene
 STILL = 0.05
 """Pixels of a training image; what moves less counts as standing still."""
 GOOD = 0.1
-"""Pixels that one Gaussian in a hundred may be off between keys where the size allows it."""
-SAMPLE = 20_000
-"""Gaussians by which keys are chosen; the error that is reported is that of all."""
-MANY = 10
-"""Frames of which each one may be a key, and nothing between them."""
-MOST_CHECKS = 8
-"""Instants at which the error is measured at most: a large field takes seconds for each."""
-MOST_STATES = 8_000_000
-"""Gaussians times instants that are evaluated and kept, 40 bytes each: of 300,000 Gaussians, 26 instants."""
+"""Pixels that one Gaussian in a hundred may be off between keys where there are so many instants."""
+MOST_STATES = 6_000_000
+"""Gaussians times instants that are evaluated and kept, 80 bytes each: of 300,000 Gaussians, 20 instants."""
 
 
 class State(NamedTuple):
@@ -49,7 +41,6 @@ class State(NamedTuple):
 class Offset(NamedTuple):
     """How far off the straight lines are between keys, in pixels of the training camera nearest by."""
 
-    median: float
     hundredth: float
     """Exceeded by one Gaussian in a hundred."""
     largest: float
@@ -57,14 +48,11 @@ class Offset(NamedTuple):
     @classmethod
     def of(cls, pixels: Tensor) -> Offset:
         """Of distances [N] in pixels."""
-        if not len(pixels):
-            return cls(0.0, 0.0, 0.0)
-        ordered = pixels.sort().values
-        places = (len(ordered) // 2, min(int(0.99 * len(ordered)), len(ordered) - 1), len(ordered) - 1)
-        return cls(*(float(ordered[place]) for place in places))
+        ordered = torch.cat([pixels.new_zeros(1), pixels]).sort().values
+        return cls(float(ordered[min(int(0.99 * len(ordered)), len(ordered) - 1)]), float(ordered[-1]))
 
     def __str__(self) -> str:
-        return f"median {self.median:.3f}, 99 % {self.hundredth:.3f}, largest {self.largest:.2f} pixels"
+        return f"99 % below {self.hundredth:.3f}, largest {self.largest:.2f} pixels"
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,12 +92,6 @@ def cholesky(covariances: Tensor) -> Tensor:
     return torch.stack([a, b, c, d, e, f], -1)
 
 
-def covariances_of(factors: Tensor) -> Tensor:
-    """Covariances [M, 6] xx xy xz yy yz zz of factors [M, 6]."""
-    a, b, c, d, e, f = factors.unbind(-1)
-    return torch.stack([a * a, a * b, a * c, b * b + d * d, b * c + d * e, c * c + e * e + f * f], -1)
-
-
 def state_at(scene: ExportScene, time: float, before: State | None = None) -> State:
     """All Gaussians at `time`; one that does not exist then stays where it was `before`, with opacity 0."""
     splats, count = scene.splats_at(time), len(scene.harmonics.coefficients)
@@ -124,104 +106,55 @@ def state_at(scene: ExportScene, time: float, before: State | None = None) -> St
     return State(positions, factors, opacities)
 
 
-def bake(scene: ExportScene, most_keys: Callable[[int, int], int]) -> Keys:
-    """The scene at key times, which are frames or, where these are few, also halfway between them.
-
-    `most_keys` says how many there may be, from the numbers of Gaussians that move and that change their shape.
-    """
+def bake(scene: ExportScene) -> Keys:
+    """The scene at key times, spread evenly over its frames and the middles between them: twice as many until the
+    straight lines are good, or all."""
     frames, count = scene.seconds, len(scene.harmonics.coefficients)
-    times = list(frames) if len(frames) > MANY else sorted({*frames, *_middles(frames)})
-    most = int(np.clip(MOST_STATES // max(count, 1), 12, len(times)))
-    times = [times[i] for i in np.unique(np.linspace(0, len(times) - 1, most).round().astype(int))]
-    travel = _Travel(scene, times)
-    rank = torch.where(travel.changes, 0, torch.where(travel.moves, 1, 2))
-    order = torch.from_numpy(morton_order(travel.first.positions.numpy()))
-    order = order[travel.shown[order]]
+    times = sorted({*frames, *((a + b) / 2 for a, b in itertools.pairwise(frames))})
+    times = [times[i] for i in _spread(len(times), max(MOST_STATES // max(count, 1), 12))]
+    states = [state_at(scene, times[0])]
+    for time in times[1:]:
+        states.append(state_at(scene, time, states[-1]))
+    first, scale = states[0], torch.zeros(count).double()
+    far, changed, faded = (torch.zeros(count).double() for _ in range(3))
+    for state in states:
+        scale = torch.maximum(scale, scene.pixels_per_unit(state.positions))
+        far = torch.maximum(far, (state.positions - first.positions).norm(dim=-1))
+        changed = torch.maximum(changed, (state.factors - first.factors).norm(dim=-1))
+        faded = torch.maximum(faded, (state.opacities - first.opacities).abs())
+    # Outside every image a moving Gaussian is held to what the others are held to.
+    scale = torch.where(scale > 0, scale, scale[scale > 0].median() if bool((scale > 0).any()) else 1.0)
+    changes = (changed * scale > STILL) | (faded > 1 / 510)
+    rank = torch.where(changes, 0, torch.where(far * scale > STILL, 1, 2))
+    order = torch.from_numpy(morton_order(first.positions.numpy()))
+    order = order[torch.stack([state.opacities for state in states]).amax(0)[order] >= ALPHA_MIN]
     rows = order[torch.sort(rank[order], stable=True).indices]
     changing, moving = int((rank[rows] == 0).sum()), int((rank[rows] < 2).sum())
-    chosen = _choose_keys(times, travel, most_keys(moving, changing))
-    states = []
-    for time in chosen:
-        now = State(*(part[rows].double() for part in travel.states[times.index(time)]))
-        states.append(State(now.positions[:moving], now.factors[:changing], now.opacities[:changing]))
-    keys = Keys(tuple(chosen), travel.first.select(rows), rows, moving, changing, tuple(states), Offset(0, 0, 0))
-    between = [time for time in sorted({*times, *_middles(chosen)}) if time not in set(chosen)]
-    off = _offset(keys, scene, between[:: -(-len(between) // MOST_CHECKS) or 1], travel.scale)
-    return replace(keys, offset=off)
+    states = [state.select(rows) for state in states]
+    keys, number = None, 2
+    while keys is None or (keys.offset.hundredth > GOOD and number < len(times)):
+        number = 2 if keys is None else min(2 * number - 1, len(times))
+        chosen = _spread(len(times), number)
+        kept = tuple(State(s.positions[:moving], s.factors[:changing], s.opacities[:changing]) for s in states)
+        kept = tuple(kept[i] for i in chosen)
+        keys = Keys(tuple(times[i] for i in chosen), states[0], rows, moving, changing, kept, Offset(0, 0))
+        off = torch.zeros(len(rows)).double()
+        for time, state in zip(times, states):
+            baked = keys.at(time)
+            apart = distance(torch.cat(state[:2], 1), torch.cat(baked[:2], 1)) * scale[rows]
+            off = torch.maximum(off, torch.where(state.opacities >= ALPHA_MIN, apart, 0))
+        keys = replace(keys, offset=Offset.of(off))
+    return keys
 
 
-class _Travel:
-    """What is known of each Gaussian after all times were visited."""
-
-    def __init__(self, scene: ExportScene, times: Sequence[float]) -> None:
-        state = self.first = state_at(scene, times[0])
-        count = len(state.positions)
-        far, changed, faded, scale = (torch.zeros(count).double() for _ in range(4))
-        strongest = state.opacities
-        self.sample = torch.arange(0, count, 1 + count // SAMPLE)
-        """Rows by which keys are chosen."""
-        self.states = list[State]()
-        """At each time, float32."""
-        for time in times:
-            state = state_at(scene, time, state)
-            scale = torch.maximum(scale, scene.pixels_per_unit(state.positions))
-            far = torch.maximum(far, (state.positions - self.first.positions).norm(dim=-1))
-            changed = torch.maximum(changed, (state.factors - self.first.factors).norm(dim=-1))
-            faded = torch.maximum(faded, (state.opacities - self.first.opacities).abs())
-            strongest = torch.maximum(strongest, state.opacities)
-            self.states.append(State(*(part.float() for part in state)))
-        # Outside every image a moving Gaussian is held to what the others are held to.
-        self.scale = torch.where(scale > 0, scale, scale[scale > 0].median() if bool((scale > 0).any()) else 1.0)
-        """[N] pixels per world unit, in the nearest training camera."""
-        self.moves = far * self.scale > STILL
-        self.changes = (changed * self.scale > STILL) | (faded > 1 / 510)
-        self.shown = strongest >= ALPHA_MIN
-
-
-def _middles(times: Sequence[float]) -> list[float]:
-    return [(a + b) / 2 for a, b in itertools.pairwise(times)]
-
-
-def _choose_keys(times: Sequence[float], travel: _Travel, most: int) -> list[float]:
-    """The first and the last time, then one after the other the time at which the straight lines are worst."""
-    last, chosen = len(times) - 1, sorted({0, len(times) - 1})
-    counts = (travel.shown & (travel.moves | travel.changes))[travel.sample]
-    path = [torch.cat(state.select(travel.sample)[:2], 1)[counts] for state in travel.states]
-    sizes = travel.scale[travel.sample][counts].float()
-    errors = [0.0] * len(times)
-
-    def measure(left: int, right: int) -> None:
-        errors[left] = errors[right] = 0.0
-        for i in range(left + 1, right):
-            share = (times[i] - times[left]) / (times[right] - times[left])
-            errors[i] = Offset.of(distance(torch.lerp(path[left], path[right], share), path[i]) * sizes).hundredth
-
-    measure(0, last)
-    while len(chosen) < most and max(errors) > GOOD:
-        worst = errors.index(max(errors))
-        place = int(np.searchsorted(chosen, worst))
-        measure(chosen[place - 1], worst)
-        measure(worst, chosen[place])
-        chosen.insert(place, worst)
-    return [times[i] for i in chosen]
+def _spread(count: int, most: int) -> list[int]:
+    """At most so many of the places 0 .. count - 1, the ends among them, evenly."""
+    return [int(i) for i in np.unique(np.linspace(0, count - 1, min(most, count)).round())]
 
 
 def distance(a: Tensor, b: Tensor) -> Tensor:
     """How far centres and ends of axes are apart at most, [M], of columns position and factor [M, 9]."""
     return (a[:, :3] - b[:, :3]).norm(dim=-1) + (a[:, 3:] - b[:, 3:]).norm(dim=-1)
-
-
-def _offset(keys: Keys, scene: ExportScene, times: Sequence[float], scale: Tensor) -> Offset:
-    """The distance between `keys` and the model at `times`, of all Gaussians that keys have, largest over time."""
-    if not times:
-        return Offset(0.0, 0.0, 0.0)
-    worst, state, sizes = torch.zeros(len(keys.rows)).double(), None, scale[keys.rows]
-    for time in times:
-        state = state_at(scene, time, state)
-        true, baked = state.select(keys.rows), keys.at(time)
-        off = distance(torch.cat(true[:2], 1), torch.cat(baked[:2], 1)) * sizes
-        worst = torch.maximum(worst, torch.where(true.opacities >= ALPHA_MIN, off, 0))
-    return Offset.of(worst)
 
 
 def morton_order(positions: np.ndarray) -> np.ndarray:

@@ -1,74 +1,109 @@
-"""One HTML file that plays the moving scene without a network: data, player and worker stand in it as text."""
+"""One HTML file that plays one moving scene or compares two, without a network: data and player stand in it as text."""
 
 from __future__ import annotations
 
 import base64
+import gzip
 import html
+from collections.abc import Sequence
 from importlib.resources import files
 from pathlib import Path
 from string import Template
 from typing import Any
 
 import numpy as np
-import torch
 
 import d2_plugin
-from d2_plugin.durable import write_text
+from d2_plugin.durable import refuse_foreign, write_text
+from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.slicing import MARGINAL_CUT
-from d2_plugin.gaussians.spherical_harmonics import colors
 from d2_plugin.reading import json_text
 from d2_plugin.recordings import Camera
+from d2_plugin.recordings.images import opencv
 from d2_plugin.runs.drawing import color_scale
-from d2_plugin.viewing.export.coded import BLOCK, MARGINAL_REACH, CodedScene, code_keys, code_lines, packed
-from d2_plugin.viewing.export.keys import SAMPLE, bake
+from d2_plugin.viewing.export.coded import BLOCK, MARGINAL_REACH, CodedScene, code_keys, code_lines
+from d2_plugin.viewing.export.keys import bake
 from d2_plugin.viewing.export.scene import ExportScene
+from d2_plugin.viewing.panels import fitted
 
 GENERATOR = "d2-4dgs"
-TEXT_PER_BYTE = 4 / 3
-"""Base64."""
-BYTES_AT_REST, BYTES_OF_POSITION, BYTES_OF_SHAPE = 28, 6, 16
-"""Per Gaussian, with 16-bit codes and before compression, without harmonics."""
+COMPRESSION = 6
 RASTER = ("near", "blur", "alpha_max", "alpha_min", "fov_clamp")
 """Settings of the rasterizer that the player's shaders obey."""
-PAGE_SCRIPTS = ("scene.js", "shaders.js", "renderer.js", "controls.js", "pace.js", "player.js")
+PAGE_SCRIPTS = ("controls.js", "scene.js", "shaders.js", "renderer.js", "pace.js", "player.js")
 WORKER_SCRIPTS = ("scene.js", "sorter.js")
+RECORDED_BYTES, RECORDED_HEIGHT, RECORDED_QUALITY = 2.5e6, 360, 80
+"""Of the recorded images in a page: all together, at most so many pixels high, quality of WebP."""
+CONTROLS_HEIGHT = 50  # pixels below the image
 
 
-def write_page(scene: ExportScene, path: Path, megabytes: float = 40.0) -> list[str]:
-    """Write the page in about `megabytes`; returns what the page says of itself.
+def _placed(data: bytearray, part: bytes) -> int:
+    """Append a part to the data of a page; returns where it begins."""
+    data += part
+    return len(data) - len(part)
 
-    Straight lines round their harmonics to fit if need be, any other scene is baked at as many key times as fit.
+
+def write_page(scenes: Sequence[ExportScene], path: Path) -> list[str]:
+    """Write the page of one scene, or of two of one recording to compare; returns what it says of itself.
+
+    Raises:
+        D2Error: scenes of different recordings, or a file that `d2 export` did not write.
     """
-    coded = _coded(scene, megabytes)
-    contents, data = packed(coded.arrays)
-    about = _about(scene, coded)
-    write_text(path, _assembled(scene.name, _header(scene, coded) | {"arrays": contents, "about": about}, data))
+    refuse_foreign(path, f'content="{GENERATOR} ', "d2 export")
+    last, data = scenes[-1], bytearray()
+    for scene in scenes:
+        where = [[camera.name for camera in one.cameras] for one in (scene, last)]
+        if scene.viewed.recording.frames != last.viewed.recording.frames or sorted(where[0]) != sorted(where[1]):
+            raise D2Error(
+                f"{scene.viewed.name} and {last.viewed.name} are of different recordings: compare runs of one recording"
+            )
+    images = _recorded(last, data)
+    models, about = [], []
+    for scene in scenes:
+        moving = scene.moving
+        coded = code_keys(bake(scene), scene.harmonics) if moving is None else code_lines(moving, scene.viewed.duration)
+        models.append(_model(scene, coded, data))
+        about += [f"{scene.viewed.name}: {line}" if len(scenes) > 1 else line for line in _about(scene, coded)]
+    if images:
+        count, size = sum(map(len, images.values())), sum(length for kept in images.values() for _, _, length in kept)
+        about.append(f"{count} recorded images of the cameras {', '.join(images)}: {size / 1e6:.1f} MB of the page")
+    camera = last.cameras[0]
+    wide = 640, round(640 * camera.height / camera.width) + CONTROLS_HEIGHT
+    about += [
+        f"{len(last.viewed.recording.frames)} frames at {last.viewed.recording.fps:g} per second",
+        f'to embed: <iframe src="{path.name}" width="{wide[0]}" height="{wide[1]}" allow="fullscreen"></iframe>',
+        f"made by d2-4dgs {d2_plugin.__version__}; no network is used",
+    ]
+    header = _header(last) | {"models": models, "recorded": images, "about": about}
+    write_text(path, _assembled(last.viewed.recording.name, header, bytes(data)))
     return about
 
 
-def _coded(scene: ExportScene, megabytes: float) -> CodedScene:
-    most_bytes = (megabytes * 1e6 - len(_assembled("", {}, b""))) / TEXT_PER_BYTE
-    if scene.moving is not None:
-        return code_lines(scene.moving, scene.duration, most_bytes)
-    coefficients = scene.harmonics.coefficients
-    at_rest = len(coefficients) * (BYTES_AT_REST + 3 * (coefficients.shape[1] - 1))
+def _recorded(scene: ExportScene, data: bytearray) -> dict[str, list[tuple[int, int, int]]]:
+    """Images of the held-out cameras: of each the place of the frame, where it stands and its length."""
+    recording, names = scene.viewed.recording, scene.viewed.test_cameras or scene.viewed.train_cameras
+    cameras = [recording.cameras[name] for name in names]
+    cv2 = opencv("a page with recorded images")
 
-    def most_keys(moving: int, changing: int) -> int:
-        each = moving * BYTES_OF_POSITION + changing * BYTES_OF_SHAPE
-        return max(int((most_bytes - at_rest) / max(1.05 * each, 1)), 2)
+    def image(camera: Camera, place: int) -> bytes:
+        pixels = recording.image(camera.name, recording.frames[place])
+        height = min(pixels.shape[0], RECORDED_HEIGHT)
+        pixels = fitted(pixels, round(pixels.shape[1] * height / pixels.shape[0]), height)
+        quality = [cv2.IMWRITE_WEBP_QUALITY, RECORDED_QUALITY]
+        return bytes(cv2.imencode(".webp", pixels[..., ::-1], quality)[1])
 
-    return code_keys(bake(scene, most_keys), scene.harmonics)
+    most = max(int(RECORDED_BYTES / sum(len(image(camera, 0)) for camera in cameras)), 1)
+    places = np.unique(np.linspace(0, len(recording.frames) - 1, most).round().astype(int)).tolist()
+    kept: dict[str, list[tuple[int, int, int]]] = {}
+    for camera in cameras:
+        for place in places:
+            written = image(camera, place)
+            kept.setdefault(camera.name, []).append((place, _placed(data, written), len(written)))
+    return kept
 
 
 def _about(scene: ExportScene, coded: CodedScene) -> list[str]:
-    count, keys = len(scene.frames), coded.keys
-    lines = [f"{len(coded.rows):,} Gaussians, {count} frame{'s' * (count > 1)} at {scene.fps:g} per second"]
-    bits = {array.name: array.bits for array in coded.arrays}.get("harmonics", 8)
-    if bits < 8:
-        off = _color_error(scene, coded)
-        lines.append(
-            f"harmonics in {bits} bits, so that the page is no larger: colours off by {off:.1f} of 255 in the mean"
-        )
+    keys, lines = coded.keys, [f"{coded.gaussians:,} Gaussians"]
     if keys is not None:
         lines.append(
             f"a deformation field at {len(keys.times)} key times, straight in between: off by {keys.offset}; "
@@ -78,47 +113,40 @@ def _about(scene: ExportScene, coded: CodedScene) -> list[str]:
         lines.append("every Gaussian moves on a straight line and fades in time, exactly as it was trained")
     if scene.background is not None:
         lines.append("behind the Gaussians the learnt background, in every direction; its colours are not rounded")
-    return [*lines, f"made by d2-4dgs {d2_plugin.__version__}; no network is used"]
+    return lines
 
 
-def _color_error(scene: ExportScene, coded: CodedScene) -> float:
-    """Mean difference of the colours that the first training camera sees, of 255; of up to `SAMPLE` Gaussians."""
-    assert scene.moving is not None
-    every = -(-len(coded.rows) // SAMPLE)
-    [decoded] = [array.decoded for array in coded.arrays if array.decoded is not None and array.name == "harmonics"]
-    true = coded.harmonics.coefficients[::every]
-    rounded = torch.cat([true[:, :1], decoded[::every].unflatten(1, (-1, 3))], 1)
-    toward = scene.moving.positions[coded.rows[::every]] - torch.as_tensor(scene.train_cameras[0].centre)
-    phase = torch.zeros(len(true)).double()
-    degrees = coded.harmonics.degree, coded.harmonics.time_degree
-    seen = [colors(part, toward, phase, *degrees) for part in (true, rounded)]
-    return 255 * float((seen[0] - seen[1]).abs().mean())
-
-
-def _header(scene: ExportScene, coded: CodedScene) -> dict[str, Any]:
-    raster, keys = scene.raster, coded.keys
+def _model(scene: ExportScene, coded: CodedScene, data: bytearray) -> dict[str, Any]:
+    """The table of one scene; its arrays go into `data`."""
+    kept = ("name", "rows", "columns", "bits")
     return {
-        "count": len(coded.rows),
+        "name": scene.viewed.name,
+        "scores": scene.viewed.scores,
+        "count": coded.gaussians,
         "motion": coded.motion,
-        "keys": None if keys is None else {"times": keys.times, "moving": keys.moving, "changing": keys.changing},
-        "degree": coded.harmonics.degree,
-        "time_degree": coded.harmonics.time_degree,
-        "name": scene.name,
+        "keys": None if coded.keys is None else coded.keys.times,
+        "degree": scene.harmonics.degree,
+        "time_degree": scene.harmonics.time_degree,
+        "raster": {name: min(getattr(scene.viewed.backbone.settings, name), 1e6) for name in RASTER},
+        "background": None if scene.background is None else scene.background.tolist(),
+        "arrays": [{name: getattr(a, name) for name in kept} | {"offset": _placed(data, a.data)} for a in coded.arrays],
+    }
+
+
+def _header(scene: ExportScene) -> dict[str, Any]:
+    outlook = scene.outlook()
+    return {
+        "name": scene.viewed.recording.name,
         "block": BLOCK,
-        "frames": scene.frames,
+        "frames": scene.viewed.recording.frames,
         "seconds": scene.seconds,
-        "duration": scene.duration,
-        "fps": scene.fps,
+        "duration": scene.viewed.duration,
         "marginal_cut": MARGINAL_CUT,
         "marginal_reach": MARGINAL_REACH,
-        "raster": {name: min(getattr(raster, name), 1e6) for name in RASTER},
-        "cameras": [
-            *(_camera(camera, held_out=False) for camera in scene.train_cameras),
-            *(_camera(camera, held_out=True) for camera in scene.test_cameras),
-        ],
-        "background": None if scene.background is None else scene.background.tolist(),
+        "cameras": [_camera(camera, camera.name in scene.viewed.test_cameras) for camera in scene.cameras],
         "palette": color_scale("viridis").tobytes().hex(),
-        **scene.outlook(),
+        **outlook,
+        "home": _camera(outlook["home"], False),
     }
 
 
@@ -137,12 +165,14 @@ def _camera(camera: Camera, held_out: bool) -> dict[str, Any]:
 
 
 def _assembled(name: str, header: dict[str, Any], data: bytes) -> str:
+    coded = base64.b64encode(gzip.compress(data, COMPRESSION, mtime=0)).decode("ascii")
     return Template(_text_of("page.html")).substitute(
         title=html.escape(name),
         generator=html.escape(f"{GENERATOR} {d2_plugin.__version__}"),
         style=_text_of("style.css"),
         header=to_json(header),
-        data=base64.b64encode(data).decode("ascii"),
+        data=coded,
+        length=max(len(coded), 1),
         worker=_text_of(*WORKER_SCRIPTS),
         script=_text_of(*PAGE_SCRIPTS),
     )

@@ -1,8 +1,4 @@
-"""The Gaussians of one instant as a 3DGS PLY file, which viewers such as SuperSplat, Brush and SIBR open.
-
-Files named `frame_00000.ply`, `frame_00001.ply`, ... that are dropped together play as an animation in SuperSplat; a
-zip of them does in Brush.
-"""
+"""The Gaussians of one instant as a 3DGS PLY; several that are dropped together play as an animation in SuperSplat."""
 
 from __future__ import annotations
 
@@ -13,6 +9,7 @@ from torch import Tensor
 
 from d2_plugin.durable import write
 from d2_plugin.gaussians.moving import MovingGaussians
+from d2_plugin.recordings.cameras.rotations import quaternion_of_rotation
 
 ALPHA_MIN = 1 / 255
 """Gaussians that stay below this opacity are never drawn, and are left out of every format."""
@@ -59,23 +56,4 @@ def scales_and_rotations(covariances: Tensor) -> tuple[Tensor, Tensor]:
     floor = (FLATTEST * variances[:, 2:]).clamp(min=torch.finfo(variances.dtype).tiny)
     mirrored = torch.linalg.det(axes) < 0
     axes = torch.cat([torch.where(mirrored[:, None, None], -axes[..., :1], axes[..., :1]), axes[..., 1:]], dim=-1)
-    return torch.maximum(variances, floor).sqrt(), _quaternions(axes)
-
-
-def _quaternions(rotations: Tensor) -> Tensor:
-    """Unit quaternions [M, 4], w first, of rotation matrices [M, 3, 3].
-
-    The four products of a component with the whole quaternion are linear in the matrix; the one with the largest
-    component loses no digits.
-    """
-    (a, b, c), (d, e, f), (g, h, i) = (row.unbind(-1) for row in rotations.unbind(-2))
-    rows = (
-        (1 + a + e + i, h - f, c - g, d - b),
-        (h - f, 1 + a - e - i, b + d, c + g),
-        (c - g, b + d, 1 - a + e - i, f + h),
-        (d - b, c + g, f + h, 1 - a - e + i),
-    )
-    products = torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
-    largest = products.diagonal(dim1=-2, dim2=-1).argmax(dim=-1)
-    chosen = products[torch.arange(len(products)), largest]
-    return chosen / chosen.norm(dim=-1, keepdim=True)
+    return torch.maximum(variances, floor).sqrt(), torch.from_numpy(quaternion_of_rotation(axes.numpy()))

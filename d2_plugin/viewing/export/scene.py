@@ -13,9 +13,9 @@ from torch import Tensor
 
 from d2_plugin.gaussians.moving import Harmonics, MovingGaussians
 from d2_plugin.gaussians.spherical_harmonics import coefficients_from_rgb
-from d2_plugin.protocol import RasterSettings, Splats
+from d2_plugin.protocol import Splats
 from d2_plugin.recordings import Camera
-from d2_plugin.viewing.camera_paths import focus_of
+from d2_plugin.viewing.camera_paths import Rig, at_pose
 from d2_plugin.viewing.export.ply import scales_and_rotations
 from d2_plugin.viewing.viewed import ViewedRun
 
@@ -24,15 +24,7 @@ from d2_plugin.viewing.viewed import ViewedRun
 class ExportScene:
     """What the formats write."""
 
-    name: str
-    frames: tuple[int, ...]
-    """Numbers of the frames, as the recording has them."""
-    seconds: tuple[float, ...]
-    """Time of each frame since the first one."""
-    fps: float
-    train_cameras: tuple[Camera, ...]
-    test_cameras: tuple[Camera, ...]
-    raster: RasterSettings
+    viewed: ViewedRun
     harmonics: Harmonics
     splats_at: Callable[[float], Splats]
     """The 3D Gaussians at a time in seconds; float32, without gradients."""
@@ -42,15 +34,15 @@ class ExportScene:
     """Spherical harmonics [16, 3] of what lies behind all Gaussians."""
 
     @property
-    def duration(self) -> float:
-        """From the first frame to the last, seconds; 0 for one frame."""
-        return self.seconds[-1]
+    def seconds(self) -> tuple[float, ...]:
+        """Time of each frame since the first one."""
+        return tuple(map(self.viewed.recording.seconds, self.viewed.recording.frames))
 
     def pixels_per_unit(self, positions: Tensor) -> Tensor:
         """Length [M] in pixels of one world unit across the line of sight, in the training camera that sees a position
         [M, 3] largest; 0 where none does."""
         largest = positions.new_zeros(len(positions))
-        for camera in self.train_cameras:
+        for camera in self.viewed.training:
             depth = self._seen_depth(camera, positions)
             largest = torch.maximum(largest, torch.where(depth > 0, camera.K[0, 0] / depth.clamp(min=1e-30), 0))
         return largest
@@ -60,28 +52,34 @@ class ExportScene:
         pose, K = (torch.as_tensor(matrix).to(positions) for matrix in (camera.T_camera_world, camera.K))
         points = positions @ pose[:3, :3].T + pose[:3, 3]
         depth = points[:, 2]
-        pixels = (points[:, :2] * K.diagonal()[:2]) / depth.clamp(min=self.raster.near)[:, None] + K[:2, 2]
+        pixels = (points[:, :2] * K.diagonal()[:2]) / depth.clamp(min=self.viewed.backbone.settings.near)[:, None] + K[
+            :2, 2
+        ]
         inside = ((pixels > 0) & (pixels < pixels.new_tensor([camera.width, camera.height]))).all(1)
-        return torch.where((depth > self.raster.near) & inside, depth, 0)
+        return torch.where((depth > self.viewed.backbone.settings.near) & inside, depth, 0)
 
-    def outlook(self) -> dict[str, list[float]]:
-        """Where a player may start, in world units: `focus` is what the training cameras look at, `up`, and
-        `depth_range` from the hundredth-nearest to the hundredth-farthest opaque Gaussian that one of them sees, at the
-        first, the middle and the last frame."""
-        cameras, depths = self.train_cameras, []
+    @property
+    def cameras(self) -> tuple[Camera, ...]:
+        """Training cameras, then those that are held out."""
+        names = (*self.viewed.train_cameras, *self.viewed.test_cameras)
+        return tuple(self.viewed.recording.cameras[name] for name in names)
+
+    def outlook(self) -> dict[str, Any]:
+        """Where a player may start and how far it may go, in world units: `focus` is what the cameras look at, `up`, a
+        camera `home`, `limits`, and `depth_range` from the hundredth-nearest to the hundredth-farthest opaque Gaussian
+        that a training camera sees, at the first, the middle and the last frame."""
+        depths = []
         for time in sorted({self.seconds[0], self.seconds[len(self.seconds) // 2], self.seconds[-1]}):
             splats = self.splats_at(time)
             opaque = splats.means[splats.opacities > 0.5].double()
-            depths += [self._seen_depth(camera, opaque) for camera in cameras]
+            depths += [self._seen_depth(camera, opaque) for camera in self.viewed.training]
         seen = torch.cat(depths)
         known = seen[seen > 0].numpy()
         near, middle, far = np.quantile(known, [0.01, 0.5, 0.99]) if len(known) else (1.0, 1.5, 2.0)
-        axes = np.stack([camera.T_camera_world[:3, :3] for camera in cameras])
-        focus = focus_of(np.stack([camera.centre for camera in cameras]), axes[:, 2], float(middle))
-        up = -axes[:, 1].mean(axis=0)
-        up = up / np.linalg.norm(up) if np.linalg.norm(up) > 1e-6 else -axes[0, 1]
-        ends = [float(near), float(max(far, near * (1 + 1e-6)))]
-        return {"focus": focus.tolist(), "up": up.tolist(), "depth_range": ends}
+        rig, ends = Rig.of(self.cameras, float(middle)), [float(near), float(max(far, near * (1 + 1e-6)))]
+        home = at_pose(self.cameras[0], rig.home)
+        places = {"focus": rig.focus.tolist(), "up": rig.up.tolist(), "limits": rig.limits(self.cameras)}
+        return places | {"home": home, "depth_range": ends}
 
     def still_at(self, time: float) -> tuple[MovingGaussians, tuple[Tensor, Tensor]]:
         """The Gaussians of one instant with its colours, and their scales [M, 3] and quaternions [M, 4]."""
@@ -89,7 +87,7 @@ class ExportScene:
         own = self.harmonics._replace(coefficients=self.harmonics.coefficients[splats.rows])
         phase = None
         if self.moving is not None and self.moving.motion is not None and own.time_degree:
-            phase = (time - self.moving.motion.times[splats.rows]) / max(self.duration, 1e-12)
+            phase = (time - self.moving.motion.times[splats.rows]) / max(self.viewed.duration, 1e-12)
         means, covariances, opacities = (part.double() for part in splats[:3])
         still = MovingGaussians(means, covariances, opacities, Harmonics(own.without_time(phase), own.degree))
         if self._lasting_shapes is None:
@@ -106,7 +104,7 @@ class ExportScene:
 @torch.no_grad()
 def export_scene(viewed: ViewedRun) -> ExportScene:
     """What is exported of a run or a checkpoint."""
-    recording, backbone, moving = viewed.recording, viewed.backbone, viewed.moving
+    backbone, moving = viewed.backbone, viewed.moving
     view = viewed.view(viewed.training[0], 0.0)
     model: Any = getattr(backbone, "model", None)  # of the bundled backbones
 
@@ -127,16 +125,5 @@ def export_scene(viewed: ViewedRun) -> ExportScene:
     if moving is None and hasattr(model, "moving"):
         moving = model.moving()
     behind = getattr(model, "background", None)
-    return ExportScene(
-        recording.name,
-        recording.frames,
-        tuple(recording.seconds(frame) for frame in recording.frames),
-        recording.fps,
-        tuple(viewed.training),
-        tuple(recording.cameras[name] for name in viewed.test_cameras),
-        backbone.settings,
-        harmonics,
-        splats_at,
-        moving,
-        None if behind is None else torch.cat([behind.constant, behind.harmonics]).detach().double().cpu(),
-    )
+    background = None if behind is None else torch.cat([behind.constant, behind.harmonics]).detach().double().cpu()
+    return ExportScene(viewed, harmonics, splats_at, moving, background)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 
+import numpy as np
 from torch import Tensor
 
 from d2_plugin.viewing.live.page import Page, Wanted
@@ -14,38 +15,24 @@ MOVING_QUALITY, STILL_QUALITY = 60, 90
 """JPEG quality."""
 SMALLEST = 72
 """Height in pixels below which no image is drawn, however slow."""
-FIXED = 4e-3
-"""Seconds of an image that do not depend on its size, before that was measured."""
 KEPT = 0.85
 """What a measurement still weighs when the next one comes."""
-APART = 0.2
+APART = 0.1
 """Spread of sizes, relative to their mean, from which both costs of an image can be told apart."""
 SAVED = 0.5
 """Seconds of time whose share may be saved up."""
 
 
-@dataclass
 class Resolution:
-    """Learns what an image and a pixel cost, so that a moving image is as large as fits its time."""
+    """What an image costs however small and what a pixel costs: a straight line through the last measurements. With it
+    a moving image is as large as fits its time. player/pace.js does the same."""
 
-    seconds_per_pixel: float = 1e-7
-    fixed: float = FIXED
-    """Seconds of an image however small: what many Gaussians cost before the first pixel."""
-    _sums: tuple[float, ...] = (0.0,) * 5
+    def __init__(self) -> None:
+        self._sums = np.array([1e-6, 1e-1, 1e-8, 1e4, 1e-3])
 
     def drew(self, pixels: int, seconds: float) -> None:
-        """Note an image: a straight line through the last measurements, where their sizes differ."""
-        new = (1.0, pixels, seconds, pixels * pixels, pixels * seconds)
-        self._sums = tuple(KEPT * old + added for old, added in zip(self._sums, new, strict=True))
-        _, x, y, xx, xy = (part / self._sums[0] for part in self._sums)
-        spread = xx - x * x
-        if spread > (APART * x) ** 2:
-            slope = (xy - x * y) / spread
-            if slope > 0:
-                self.seconds_per_pixel, self.fixed = slope, max(y - slope * x, 0.0)
-                return
-            self.fixed = FIXED  # smaller ones took longer: the machine has other work now
-        self.seconds_per_pixel = max(y - self.fixed, 1e-6) / max(x, 1)
+        """Note an image."""
+        self._sums = KEPT * self._sums + (1.0, pixels, seconds, pixels * pixels, pixels * seconds)
 
     def size(self, aspect: float, most: int, seconds: float | None = None) -> tuple[int, int]:
         """Width and height, at most `most` pixels high, that take about `seconds`; None is as large as allowed.
@@ -53,8 +40,13 @@ class Resolution:
         Where an image costs as much however small, half as much goes into its pixels: fewer would gain little."""
         height = most
         if seconds is not None:
-            left = max(seconds - self.fixed, 0.5 * self.fixed, 1e-3)
-            height = int((left / self.seconds_per_pixel / max(aspect, 1e-3)) ** 0.5)
+            x, y, xx, xy = self._sums[1:] / self._sums[0]
+            spread, whole = xx - x * x, y / x
+            slope = (xy - x * y) / spread if spread > (APART * x) ** 2 else 0.0
+            pixel = min(slope, whole) if slope > 0 else whole  # smaller ones took longer: the machine has other work
+            fixed = y - pixel * x
+            left = max(seconds - fixed, 0.5 * fixed, 1e-3)
+            height = int(min(left / max(pixel, 1e-12) / max(aspect, 1e-3), 1e9) ** 0.5)
         height = max(min(height, most), min(SMALLEST, most))
         return max(round(height * aspect), 1), height
 
@@ -87,10 +79,24 @@ def draw(page: Page, wanted: Wanted, marked: Tensor | None, seconds: float | Non
     start = time.perf_counter()
     size = resolution.size(wanted.aspect, wanted.height, seconds)
     known = wanted.marked and marked is not None and len(marked) == len(viewed.backbone)
-    view = viewed.view(wanted.camera(*size), wanted.time)
+    view, compared = viewed.view(wanted.camera(*size), wanted.time), wanted.recorded > 0 or wanted.show == "error"
+    if wanted.standing is not None and compared:
+        camera, frame = viewed.recording.cameras[wanted.standing], viewed.frame_at(wanted.time)
+        shape = max(round(size[1] * camera.width / camera.height), 1), size[1]
+        view = viewed.view(camera, viewed.recording.seconds(frame), shape)
     shot = Shot(viewed, view, None, wanted.min_opacity, marked if known else None)
+    image = KINDS[wanted.show](shot).image
+    if wanted.recorded > 0:
+        image = np.rint((1 - wanted.recorded) * image + wanted.recorded * shot.truth).astype(np.uint8)
     quality = STILL_QUALITY if seconds is None else MOVING_QUALITY
-    scene.set_background_image(KINDS[wanted.show](shot).image, format="jpeg", jpeg_quality=quality)
+    scene.set_background_image(_filled(image, size[0]), format="jpeg", jpeg_quality=quality)
     taken = time.perf_counter() - start
     resolution.drew(size[0] * size[1], taken)
     page.set_text("size", f"{size[0]}x{size[1]}, {1000 * taken:.0f} ms")
+
+
+def _filled(image: np.ndarray, width: int) -> np.ndarray:
+    """The image [H, W, 3] with another width: black is added, or cut, alike on both sides."""
+    missing = max(width - image.shape[1], 0)
+    cut = max(image.shape[1] - width, 0) // 2
+    return np.pad(image, ((0, 0), (missing // 2, missing - missing // 2), (0, 0)))[:, cut : cut + width]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -13,6 +12,7 @@ from d2_plugin.priors.sheet import label_colors
 from d2_plugin.protocol import DepthPrior, Label
 from d2_plugin.recordings import Camera
 from d2_plugin.recordings.cameras.rotations import quaternion_of_rotation
+from d2_plugin.viewing.camera_paths import Rig
 from d2_plugin.viewing.live.page import Page, vertical_angle
 from d2_plugin.viewing.panels import fitted, prior_sigma_colors
 from d2_plugin.viewing.viewed import ViewedRun
@@ -21,6 +21,8 @@ THUMBNAIL = 128
 """Width of an image in a frustum, pixels."""
 TRAINING, HELD_OUT = (70, 160, 255), (255, 150, 40)
 """RGB of cameras that train and of those that are held out."""
+FRUSTUM, NEAR = 0.03, 12.0
+"""Size of a frustum relative to the distance of what the cameras look at; how near, in its sizes, it is hidden."""
 MOST_POINTS = 60_000
 """Of all cameras together: a browser draws them at every frame."""
 
@@ -46,21 +48,22 @@ class Overlay:
             self._show_cloud(viewed, frame, moving)
 
     def _show_frusta(self, viewed: ViewedRun, frame: int, moving: bool) -> None:
-        visible = self.page.ticked("frusta", True)
+        last = self.page.last
+        # Those around would stand before the image of the camera where we stand.
+        visible = self.page.ticked("frusta", True) and (last is None or last.standing is None)
         if visible and set(self.frusta) != set(viewed.recording.cameras):
             for number, (name, camera) in enumerate(viewed.recording.cameras.items()):
                 if name not in self.frusta:
                     self.frusta[name] = self._frustum(number, camera, name in viewed.train_cameras)
             self._images_of = None
-        scale = self.unit * self.page.number("size_of_frusta", 1.0)
-        eye = np.array(self.page.eye)
         for name, handle in self.frusta.items():
-            # One that stands where we do would fill the screen with its small image.
-            near = np.linalg.norm(viewed.recording.cameras[name].centre - eye) < 1.5 * scale
-            if handle.visible != (visible and not near):
-                handle.visible = visible and not near
-            if handle.scale != scale:
-                handle.scale = scale
+            # One beside us would fill the screen with its small image.
+            far = (
+                np.linalg.norm(viewed.recording.cameras[name].centre - (last.pose[:3] if last else 0))
+                > NEAR * self.unit
+            )
+            if handle.visible != (visible and far):
+                handle.visible = visible and far
         if visible and not moving and frame != self._images_of:
             self._images_of = frame
             for name, handle in self.frusta.items():
@@ -75,7 +78,8 @@ class Overlay:
             vertical_angle(camera),
             camera.width / camera.height,
             scale=self.unit,
-            thickness=0.04 * self.unit,
+            thickness=1.5,
+            thickness_units="screen",
             color=TRAINING if trains else HELD_OUT,
             wxyz=quaternion_of_rotation(camera.T_camera_world[:3, :3].T),
             position=camera.centre,
@@ -85,7 +89,6 @@ class Overlay:
 
     def _show_cloud(self, viewed: ViewedRun, frame: int, moving: bool) -> None:
         by = self.page.word("cloud", "none")
-        size = self.unit * 0.03 * self.page.number("point_size", 1.0)
         if by == "none" and self.cloud is not None:
             self.cloud.remove()
             self.cloud = self._cloud_of = None
@@ -95,28 +98,14 @@ class Overlay:
             self._cloud_of = frame, by
             positions, colors = cloud_of(viewed, frame, by)
             self.cloud = self.page.client.scene.add_point_cloud(
-                "/prior", positions, colors, point_size=size, point_shape="circle", precision="float32"
+                "/prior", positions, colors, point_size=0.06 * self.unit, point_shape="circle", precision="float32"
             )
-        if self.cloud is not None and self.cloud.point_size != size:
-            self.cloud.point_size = size
 
 
 def frustum_size(viewed: ViewedRun) -> float:
-    """A tenth of the way from the cameras to what they look at, or less where cameras stand close together."""
-    centres = np.stack([camera.centre for camera in viewed.recording.cameras.values()])
-    gaps = np.linalg.norm(centres[:, None] - centres[None], axis=-1)
-    gaps[gaps == 0] = math.inf
-    # The usual gap: a held-out camera that nearly touches another must not make all of them too small to see.
-    usual = float(np.median(gaps.min(axis=1)))
-    size = min((viewed.depth or math.inf) / 10, 0.5 * usual)
-    return size if math.isfinite(size) else 0.2
-
-
-def rig_of(viewed: ViewedRun) -> tuple[np.ndarray, float]:
-    """Where the cameras' middle is, [3], and how far one has to be from it to see all of them."""
-    centres = np.stack([camera.centre for camera in viewed.recording.cameras.values()])
-    middle = centres.mean(axis=0)
-    return middle, max(float(np.linalg.norm(centres - middle, axis=1).max()), 3 * frustum_size(viewed))
+    """A part of the way from the cameras to what they look at."""
+    rig = Rig.of(list(viewed.recording.cameras.values()), viewed.depth)
+    return max(FRUSTUM * float(np.linalg.norm(rig.middle - rig.focus)), 1e-6)
 
 
 class Cloud(NamedTuple):

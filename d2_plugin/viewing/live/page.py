@@ -1,16 +1,16 @@
 """One browser's page: its controls, what it lays over the image, and the image that it wants next.
 
-viser calls back from threads of its own; they only set plain values here. Everything is drawn by the thread that calls
-`Viewer`, so that no image is taken of Gaussians that change.
+viser calls back from threads of its own; they only set plain values here, and the thread that calls `Viewer` draws.
 
 A client may send anything: `Page` takes numbers within the ends of their sliders, words that stand in their menus and a
-camera that can be one, and keeps what it had where a message is none of these. Names come from folders and files of
-others; they go into text fields and menus only, which show any text as it is, never into Markdown or HTML.
+camera that can be one, and keeps what it had where a message is none of these. Names of folders and files go into text
+fields and menus only, which show any text as it is, never into Markdown or HTML.
 """
 
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -20,6 +20,7 @@ import numpy as np
 from d2_plugin.recordings import Camera
 from d2_plugin.recordings.cameras.camera import FIELD_OF_VIEW, LARGEST_NUMBER, pinhole, rigid
 from d2_plugin.recordings.cameras.rotations import quaternion_of_rotation, rotation_of_quaternion
+from d2_plugin.viewing.camera_paths import between, camera_path_text
 from d2_plugin.viewing.viewed import ViewedRun
 
 REST = 0.3
@@ -27,8 +28,14 @@ REST = 0.3
 WIDEST = 10.0
 """Of an image, relative to its height, or the other way round."""
 SPEEDS = {f"{speed:g}": speed for speed in (0.1, 0.25, 0.5, 1.0, 2.0)}
-IMAGES = {"image": "rgb", "depth": "depth", "opacity": "alpha", "number of Gaussians": "count"}
+IMAGES = {"image": "rgb", "error": "error", "depth": "depth", "opacity": "alpha"}
 """What the menu says -> the kind of image."""
+AT_CAMERA = 1e-3
+"""Of the numbers of a pose, relative to a camera's distance: who is so near stands at the camera."""
+MOST_KEYFRAMES, PATH_SIZE = 1000, (1280, 720)
+"""Of a camera path, and the pixels of its images."""
+PATH_RATE = 30.0
+"""Images per second of a camera path."""
 NO_IMAGE = "nothing"
 CLOUDS = ("none", "label", "sigma", "image")
 FREE = "free"
@@ -44,6 +51,10 @@ class Wanted(NamedTuple):
     min_opacity: float
     marked: bool
     height: int
+    standing: str | None = None
+    """The camera of the recording at which the page stands."""
+    recorded: float = 0.0
+    """Share of the recorded image in the image there."""
 
     def camera(self, width: int, height: int) -> Camera:
         """The browser's camera for an image of this size."""
@@ -75,8 +86,12 @@ class Page:
     controls: dict[str, Any] = field(default_factory=dict)
     changed_at: float = 0.0
     drawn: tuple[Wanted, int, bool] | None = None
-    _last: Wanted | None = None
+    keyframes: list[Wanted] = field(default_factory=list)
+    """Of the camera path."""
+    last: Wanted | None = None
+    """What it wanted last."""
     _played_at: float | None = None
+    _previewed: tuple[float, list[tuple[Camera, float]]] | None = None
 
     def build(self) -> None:
         """Lay out the controls; what the run does not have is left out."""
@@ -104,19 +119,25 @@ class Page:
                 controls["show"] = gui.add_dropdown("show", [*IMAGES, NO_IMAGE], initial_value="image")
                 controls["opacity"] = gui.add_slider("opacity from", 0.0, 0.95, 0.05, 0.0)
                 controls["marked"] = gui.add_checkbox("inserted by D2 in orange", False, disabled=not known)
+                controls["recorded"] = gui.add_slider("recorded over it", 0.0, 1.0, 0.05, 0.0)
                 controls["height"] = gui.add_slider("height", min(90, height), max(height * 2, 720), 1, height)
         with gui.add_folder("Recording"):
             names = tuple(viewed.recording.cameras)
             controls["camera"] = gui.add_dropdown("stand at", [FREE, *names], initial_value=FREE)
             controls["camera"].on_update(lambda _: self.stand_at(controls["camera"].value))
             controls["frusta"] = gui.add_checkbox("cameras", True)
-            controls["size_of_frusta"] = gui.add_slider("camera size", 0.1, 3.0, 0.1, 1.0)
             if viewed.store is not None:
                 first = "none" if viewed.backbone is not None else "image"
                 controls["cloud"] = gui.add_dropdown("prior as points, by", CLOUDS, initial_value=first)
-                controls["point_size"] = gui.add_slider("point size", 0.2, 5.0, 0.1, 1.0)
         if viewed.backbone is not None:
             self._text("size", "image size")
+            with gui.add_folder("Camera path", expand_by_default=False):
+                self._text("keyframes", "keyframes", "none")
+                controls["path_seconds"] = gui.add_slider("seconds to the next", 0.2, 10.0, 0.1, 2.0)
+                acts = {"Add keyframe": lambda _: self._keep(1), "Remove the last": lambda _: self._keep(-1)}
+                acts |= {"Preview": lambda _: self._preview(), "Save camera_path.json": lambda _: self._save()}
+                for label, act in acts.items():
+                    gui.add_button(label).on_click(act)
         for control in controls.values():
             if hasattr(control, "on_update"):
                 control.on_update(lambda _: self.wake())
@@ -141,10 +162,44 @@ class Page:
         """Whether a box is ticked; the default where there is none."""
         return self.controls[name].value is True if name in self.controls else default
 
-    @property
-    def eye(self) -> tuple[float, ...]:
-        """Where the browser's camera stands, [3]."""
-        return (0.0, 0.0, 0.0) if self._last is None else self._last.pose[:3]
+    def _standing(self, pose: tuple[float, ...]) -> str | None:
+        R = rotation_of_quaternion(np.array(pose[3:7])).T
+        for name, camera in self.viewed.recording.cameras.items():
+            near = AT_CAMERA * max(float(np.abs(camera.centre).max()), 1e-3)
+            turned = np.abs(camera.T_camera_world[:3, :3] - R).max()
+            if np.abs(camera.centre - pose[:3]).max() < near and turned < AT_CAMERA:
+                return name
+        return None
+
+    def _keep(self, more: int) -> None:
+        """Make the image that is seen a keyframe, or forget the last one."""
+        if more > 0 and self.last is not None and len(self.keyframes) < MOST_KEYFRAMES:
+            self.keyframes.append(self.last)
+        elif more < 0:
+            del self.keyframes[-1:]
+        self.set_text("keyframes", str(len(self.keyframes) or "none"))
+
+    def path(self) -> list[tuple[Camera, float]]:
+        """The cameras from keyframe to keyframe, with their instants in seconds."""
+        chain = [key.camera(*PATH_SIZE) for key in self.keyframes]
+        seconds = self.number("path_seconds", 2.0) * (len(chain) - 1)
+        places = np.linspace(0, len(chain) - 1, max(round(seconds * PATH_RATE), 1)).tolist() if chain else []
+        times = [float(np.interp(place, range(len(chain)), [key.time for key in self.keyframes])) for place in places]
+        return [(between(chain, place), instant) for place, instant in zip(places, times)]
+
+    def path_file(self) -> bytes:
+        """The path as nerfstudio's camera_path.json."""
+        cameras = [camera for camera, _ in self.path()]
+        shares = [instant / max(self.viewed.duration, 1e-9) for _, instant in self.path()]
+        return camera_path_text(cameras, shares, PATH_RATE).encode()
+
+    def _save(self) -> None:
+        if self.keyframes:
+            self.client.send_file_download("camera_path.json", self.path_file(), save_immediately=True)
+
+    def _preview(self) -> None:
+        self._previewed = time.monotonic(), self.path()
+        self.wake()
 
     def set_text(self, name: str, text: str) -> None:
         """Change a line of text."""
@@ -169,8 +224,10 @@ class Page:
     def stand_at(self, name: object) -> None:
         """Bring the browser's camera to one of the recording's."""
         camera = self.viewed.recording.cameras.get(name) if isinstance(name, str) else None
-        if camera is None:
-            return
+        if camera is not None:
+            self._move_to(camera)
+
+    def _move_to(self, camera: Camera) -> None:
         R = camera.T_camera_world[:3, :3]
         with self.client.atomic():
             handle = self.client.camera
@@ -181,7 +238,16 @@ class Page:
         self.wake()
 
     def play(self, now: float) -> None:
-        """Move the slider on where the page plays; at the end it begins again."""
+        """Move the slider on where the page plays, or follow the camera path that it previews."""
+        if self._previewed is not None:
+            began, path = self._previewed
+            place = int((now - began) * PATH_RATE)
+            if place >= len(path):
+                self._previewed = None
+            else:
+                self._move_to(path[place][0])
+                if "time" in self.controls:
+                    self.controls["time"].value = path[place][1]
         if not self.ticked("play"):
             self._played_at = None
             return
@@ -189,27 +255,27 @@ class Page:
             passed = (now - self._played_at) * SPEEDS[self.word("speed", "1")]
             slider = self.controls["time"]
             end = self.viewed.duration + 1 / self.viewed.recording.fps
-            time = (self.number("time", 0.0) + passed) % end
-            slider.value = float(min(time, slider.max))
+            slider.value = float(min((self.number("time", 0.0) + passed) % end, slider.max))
         self._played_at = now
 
     def wanted(self, now: float) -> tuple[Wanted, bool] | None:
         """What the page wants, and whether something moves; None before the browser has a camera that can be one."""
-        seen = _seen_through(self.client.camera) or (None if self._last is None else self._last[:2])
+        seen = _seen_through(self.client.camera) or (None if self.last is None else self.last[:2])
         if seen is None:
             return None
         show = IMAGES.get(self.word("show", NO_IMAGE), "")
-        time, least, height = (
-            self.number("time", 0.0),
-            self.number("opacity", 0.0),
-            self.number("height", self.most_height),
-        )
-        wanted = Wanted(*seen, time, show, least, self.ticked("marked"), int(height))
-        if wanted != self._last:
-            self._last = wanted
+        instant, least = self.number("time", 0.0), self.number("opacity", 0.0)
+        height = self.number("height", self.most_height)
+        at = self._standing(seen[0])
+        recorded = self.number("recorded", 0.0) if at else 0.0
+        if show == "error" and at is None:
+            show = "rgb"
+        wanted = Wanted(*seen, instant, show, least, self.ticked("marked"), int(height), at, recorded)
+        if wanted != self.last:
+            self.last = wanted
             if self._played_at is None:
                 self.changed_at = now
-        return wanted, self._played_at is not None or now - self.changed_at < REST
+        return wanted, self._played_at is not None or self._previewed is not None or now - self.changed_at < REST
 
 
 def vertical_angle(camera: Camera) -> float:

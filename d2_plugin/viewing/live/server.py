@@ -11,15 +11,16 @@ import functools
 import io
 import secrets
 import socket
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stdout
 from http import HTTPStatus
 from http.cookies import CookieError, SimpleCookie
-from types import ModuleType
 from typing import Any, NamedTuple
 from urllib.parse import parse_qs, urlsplit
 
-from d2_plugin.errors import D2Error, missing_extra
+from d2_plugin.errors import D2Error
+from d2_plugin.extras import imported
 
 LOCAL = ("127.0.0.1", "localhost", "::1")
 COOKIE = "d2-view"
@@ -32,19 +33,6 @@ class Page(NamedTuple):
     url: str
 
 
-def viser() -> ModuleType:
-    """The module viser.
-
-    Raises:
-        MissingExtra: where it is not installed.
-    """
-    try:
-        import viser
-    except ImportError:
-        raise missing_extra("viser", "view", "the live viewer") from None
-    return viser
-
-
 def serve(host: str, port: int) -> Page:
     """Start to serve at an address, on the next free port where this one is in use.
 
@@ -52,9 +40,12 @@ def serve(host: str, port: int) -> Page:
         D2Error: nothing can listen at that address.
     """
     _check_address(host)
+    # Of a page that was closed while its image was drawn.
+    warnings.filterwarnings("ignore", "Queued a .* on a closed connection")
     token = secrets.token_urlsafe(16)
     with redirect_stdout(io.StringIO()), _guarded(Access(host, token)):  # it prints a table with addresses
-        server = viser().ViserServer(host=host, port=port, label="D2-4DGS", verbose=False)
+        viser = imported("viser", "viser", "view", "the live viewer")
+        server = viser.ViserServer(host=host, port=port, label="D2-4DGS", verbose=False)
     server.gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=True, control_width="medium")
     name = "localhost" if host in ("127.0.0.1", "0.0.0.0") else f"[{host}]" if ":" in host else host
     return Page(server, f"http://{name}:{server.get_port()}/?token={token}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import sys
 import time
 from collections import deque
@@ -18,13 +19,12 @@ from d2_plugin.runs.metrics import psnr
 from d2_plugin.runs.run import Run
 from d2_plugin.runs.saved import OnStep
 from d2_plugin.settings import Downscale, Positional, Range, Settings
-from d2_plugin.store.store import PriorStore
 from d2_plugin.viewing.checkpoints import is_output_folder, open_viewed
 from d2_plugin.viewing.live.images import Share
 from d2_plugin.viewing.live.server import LOCAL
 from d2_plugin.viewing.live.viewer import Viewer
-from d2_plugin.viewing.rendering import render_view
-from d2_plugin.viewing.viewed import ViewedRun, viewed_recording, viewed_store, viewed_training
+from d2_plugin.viewing.panels import Shot
+from d2_plugin.viewing.viewed import ViewedRun, viewed_recording, viewed_training
 
 SCORED = 0.02
 """Share of a training's time that its score so far may take, while somebody looks."""
@@ -74,9 +74,11 @@ def viewed_at(settings: ViewSettings) -> ViewedRun:
     """
     path = settings.shown
     if (path / "store.json").is_file():
-        if settings.recording is None:
-            return viewed_store(PriorStore.open(path))
-        return viewed_recording(open_recording(settings.recording, downscale=settings.downscale), path)
+        if settings.recording is not None:
+            return viewed_recording(open_recording(settings.recording, downscale=settings.downscale), path)
+        if not (path.parent / "run.json").is_file():
+            raise D2Error(f"{path} lies in no folder of a run: name its recording with --recording")
+        return viewed_recording(Run.load(path.parent).scene.recording, path)
     if path.is_file() or (path / "run.json").is_file() or is_output_folder(path):
         return open_viewed(path, settings.recording, settings.train_cameras, settings.downscale)
     if path.is_dir() and not any(path.iterdir()):
@@ -137,22 +139,20 @@ class LiveRun:
 def _scores(viewed: ViewedRun) -> Iterator[str | None]:
     """PSNR of the held-out views so far, one view after the other; None where its share of the time allows no more."""
     recording, share, last = viewed.recording, Share(SCORED), time.monotonic()
-    names = viewed.test_cameras or viewed.train_cameras
+    kind, names = ("held-out", viewed.test_cameras) if viewed.test_cameras else ("training", viewed.train_cameras)
     views = [(name, frame) for frame in recording.frames for name in names]
     scores: deque[float] = deque(maxlen=min(AVERAGED, len(views)))
-    kind, visited = "held-out" if viewed.test_cameras else "training", 0
-    while True:
-        now = time.monotonic()
-        share.passes(now - last)
-        last = now
-        if not share.due:
-            yield None
-            continue
+    for number in itertools.count():
         # Steps that share no factor with the number of views visit all of them, spread over the recording.
-        name, frame = views[visited * 7919 % len(views)]
-        visited += 1
-        view = viewed.view(recording.cameras[name], recording.seconds(frame))
-        truth = torch.from_numpy(recording.image(name, frame)).float() / 255
-        scores.append(psnr(render_view(viewed.backbone, view).color, truth))
+        name, frame = views[number * 7919 % len(views)]
+        while True:
+            now = time.monotonic()
+            share.passes(now - last)
+            last = now
+            if share.due:
+                break
+            yield None
+        shot = Shot(viewed, viewed.view(recording.cameras[name], recording.seconds(frame)))
+        scores.append(psnr(shot.rendered.color, torch.from_numpy(shot.truth).float() / 255))
         share.spent += time.monotonic() - now
         yield f"{sum(scores) / len(scores):.2f} dB PSNR, {kind}, last {len(scores)} views"

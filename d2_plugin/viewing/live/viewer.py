@@ -2,9 +2,8 @@
 
     viewer = Viewer(d2)              # after D2Hooks: the page at viewer.url shows the model as it trains
 
-Images are drawn by the thread that trains, between two steps: nothing is locked, and no half-edited model is shown.
-Training is the same with and without: the viewer reads, draws nothing at random, and waits where somebody pauses. What
-goes wrong with one browser's page closes that page; the training goes on.
+Images are drawn by the thread that trains, between two steps: nothing is locked, no half-edited model is shown, and
+training is the same with and without. What goes wrong with one browser's page closes that page; the training goes on.
 """
 
 from __future__ import annotations
@@ -26,8 +25,9 @@ from d2_plugin.hooks.reports import Report
 from d2_plugin.plugin import D2Hooks
 from d2_plugin.protocol import View
 from d2_plugin.values import checked_arguments
+from d2_plugin.viewing.camera_paths import Rig
 from d2_plugin.viewing.live.images import Resolution, Share, draw
-from d2_plugin.viewing.live.overlay import Overlay, frustum_size, rig_of
+from d2_plugin.viewing.live.overlay import Overlay, frustum_size
 from d2_plugin.viewing.live.page import Page, Training, vertical_angle
 from d2_plugin.viewing.live.server import serve
 from d2_plugin.viewing.viewed import ViewedRun, viewed_views
@@ -128,19 +128,16 @@ class Viewer:
             self._server.stop()
 
     def aim(self) -> None:
-        """Let new clients begin where the first training camera stands; behind all cameras where they are the show."""
+        """Let new clients begin in front of what the cameras look at, between them; behind all cameras where they are
+        the show."""
         viewed = self.viewed
         if viewed is None:
             return
-        camera = viewed.training[0] if viewed.train_cameras else next(iter(viewed.recording.cameras.values()))
-        T, initial = camera.T_camera_world, self._server.initial_camera
-        eye, up, ahead = camera.centre, -T[1, :3], T[2, :3]
-        target = eye + (viewed.depth or 3.0) * ahead
-        if viewed.backbone is None:
-            middle, reach = rig_of(viewed)
-            target, eye = middle + reach * ahead, middle - 1.1 * reach * ahead + 0.5 * reach * up
-        initial.position, initial.look_at, initial.up = eye, target, up
-        initial.fov = vertical_angle(camera)
+        cameras = viewed.training or list(viewed.recording.cameras.values())
+        rig, initial = Rig.of(cameras, viewed.depth), self._server.initial_camera
+        back = 1.0 if viewed.backbone is not None else 1.6
+        initial.position = rig.focus + back * (rig.middle - rig.focus)
+        initial.look_at, initial.up, initial.fov = rig.focus, rig.up, vertical_angle(cameras[0])
 
     # Called by threads of viser, which touch nothing but the table of clients.
     def _connected(self, client: Any) -> None:

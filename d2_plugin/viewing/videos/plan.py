@@ -12,13 +12,13 @@ import numpy as np
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.recordings import Camera
 from d2_plugin.settings import Downscale, Positional, Range, Settings
-from d2_plugin.viewing.camera_paths import orbit, read_camera_path, spiral, through
+from d2_plugin.viewing.camera_paths import orbit, read_camera_path, through
 from d2_plugin.viewing.panels import RECORDED
 from d2_plugin.viewing.videos.video import RATES, Format
 from d2_plugin.viewing.viewed import ViewedRun
 
 STANDING = ("held-out", "training")
-MOVING = ("orbit", "spiral", "through")
+MOVING = ("orbit", "through")
 """Paths by name; anything else is the path of a file."""
 MOVING_SECONDS = 6.0
 """Length of a video whose camera moves, where the recording is shorter."""
@@ -36,9 +36,9 @@ class RenderSettings(Settings):
     """File of the video, or folder of its PNGs; by default in videos/ of the first run."""
     path: str = "held-out"
     """Where the camera stands: held-out (each held-out camera in turn), training (each training camera), or where it
-    moves: orbit, spiral, through (the training cameras), or a nerfstudio camera_path.json."""
+    moves: orbit, through (the training cameras), or a nerfstudio camera_path.json."""
     show: tuple[str, ...] = ("rgb",)
-    """Images beside each other, joined by commas: rgb, depth, alpha, count (Gaussians per pixel); at the recording's
+    """Images beside each other, joined by commas: rgb, depth, alpha; at the recording's
     cameras also truth, error, true-depth, and from the depth prior: prior, sigma, labels."""
     cameras: tuple[str, ...] | None = None
     """Cameras of the path; by default all held-out or all training cameras."""
@@ -58,7 +58,7 @@ class RenderSettings(Settings):
     height: Annotated[int, Range(1, 16384, unit="pixels")] | None = None
     """Height of each image; by default the camera's, or in proportion to the width."""
     format: Format = "mp4"
-    """mp4 (H.264 that browsers play), webp or gif (animated, in loops), png (one file per image)."""
+    """mp4 (H.264 that browsers play), webp (animated, in a loop), png (one file per image)."""
     quality: Annotated[int, Range(0, 51)] = 18
     """Constant rate factor of mp4, 0 is lossless; the quality of webp is 100 less twice this."""
     no_captions: bool = False
@@ -132,7 +132,7 @@ def _standing(viewed: ViewedRun, settings: RenderSettings, fps: float) -> list[S
     of_path = viewed.test_cameras if settings.path == "held-out" else viewed.train_cameras
     names = _known(viewed, settings.cameras or of_path)
     if not names:
-        raise D2Error(f"{viewed.name} has no held-out camera: choose --path training, through, orbit or spiral")
+        raise D2Error(f"{viewed.name} has no held-out camera: choose --path training, through or orbit")
     if settings.seconds is not None:
         count = _count(settings.seconds * fps, 1)
     elif settings.at is None and viewed.duration > 0:
@@ -150,8 +150,6 @@ def _moving(viewed: ViewedRun, settings: RenderSettings, fps: float) -> list[Sto
     count = _count((settings.seconds or max(MOVING_SECONDS, played)) * fps, 2)
     if settings.path == "orbit":
         path = orbit(cameras, count, settings.degrees, viewed.depth)
-    elif settings.path == "spiral":
-        path = spiral(cameras, count, viewed.depth)
     else:
         path = through(cameras, count)
     return [Stop(camera, time) for camera, time in zip(path, _instants(viewed, settings, count, fps), strict=True)]
@@ -161,7 +159,7 @@ def _from_file(viewed: ViewedRun, settings: RenderSettings) -> tuple[list[Stop],
     if not settings.path.endswith(".json"):
         raise unknown_name("camera path", settings.path, [*STANDING, *MOVING, "FILE.json"])
     path = read_camera_path(Path(settings.path))
-    fps = settings.fps or path.fps
+    fps = settings.fps or (len(path.cameras) / settings.seconds if settings.seconds else path.fps)
     if path.shares is not None and settings.at is None:
         times = [share * viewed.duration for share in path.shares]
     else:

@@ -1,4 +1,4 @@
-"""Images into a file that others play: MP4 for browsers, animated WebP or GIF for a page, PNGs for measurements.
+"""Images into a file that others play: MP4 for browsers, animated WebP for a page, PNGs for measurements.
 
 H.264 with half the colour resolution needs even sides: an image of odd width or height gets one more column or row, a
 copy of its last. Nothing is scaled. Scores are never computed from a video.
@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from fractions import Fraction
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 
@@ -25,26 +25,13 @@ from d2_plugin.reading import said
 from d2_plugin.recordings.images import checked_image, write_png
 from d2_plugin.values import checked_arguments
 
-Format = Literal["mp4", "webp", "gif", "png"]
+Format = Literal["mp4", "webp", "png"]
 RATES = (0.001, 1000.0)
 """Images per second that files of videos can say."""
 
 
-class Encoding(NamedTuple):
-    """FFmpeg's names for one format."""
-
-    muxer: str
-    codec: str
-    pixels: str
-    options: dict[str, str]
-    """Of the container."""
-
-
-ENCODINGS = {
-    "mp4": Encoding("mp4", "libx264", "yuv420p", {"movflags": "+faststart"}),
-    "webp": Encoding("webp", "libwebp_anim", "yuv420p", {"loop": "0"}),
-    "gif": Encoding("gif", "gif", "pal8", {"loop": "0"}),
-}
+CODECS = {"mp4": ("libx264", {"movflags": "+faststart"}), "webp": ("libwebp_anim", {"loop": "0"})}
+"""FFmpeg's name of a format's codec, and the options of its container."""
 
 Add = Callable[[np.ndarray], None]
 """Adds an image, RGB uint8 [H, W, 3], to a video; all have the size of the first."""
@@ -57,7 +44,7 @@ def write_video(path: Path, form: Format, fps: float, quality: int = 18) -> Iter
 
     Args:
         path: the file; a folder of 00000.png, ... for `png`.
-        form: mp4 (H.264, yuv420p, fast start), webp and gif (endless loops), or png.
+        form: mp4 (H.264, yuv420p, fast start), webp (an endless loop), or png.
         fps: images per second.
         quality: x264's constant rate factor for mp4, 0 is lossless and 51 the worst; webp's quality is 100 less twice
             this number.
@@ -100,10 +87,8 @@ class _Encoder:
 
     def __init__(self, av: Any, path: Path, form: str, rate: Fraction, quality: int) -> None:
         self.av, self.form, self.rate, self.quality, self.count = av, form, rate, quality, 0
-        encoding = ENCODINGS[form]
-        self.container: Any = av.open(str(path), "w", format=encoding.muxer, options=encoding.options)
+        self.container: Any = av.open(str(path), "w", format=form, options=CODECS[form][1])
         self.stream: Any = None
-        self.palette: Any = None
 
     def add(self, image: np.ndarray) -> None:
         image = checked_image(image, "an image of a video")
@@ -121,29 +106,18 @@ class _Encoder:
             frame = frame.reformat(format="yuv420p", interpolation=colors.Interpolation.AREA, **to)
         frame.pts, frame.time_base = self.count, 1 / self.rate
         self.count += 1
-        if self.form == "gif":  # kept until the end: the palette is that of all images
-            self.palette = self.palette or self._palette(frame)
-            self.palette[0].push(frame)
-        else:
-            self.container.mux(self.stream.encode(frame))
+        self.container.mux(self.stream.encode(frame))
 
     def close(self) -> None:
         """Write what is still inside."""
         if self.stream is None:
             raise D2Error("a video without an image: choose a longer path or more frames")
-        if self.palette is not None:
-            source, sink = self.palette
-            source.push(None)
-            with suppress(self.av.error.EOFError, self.av.error.BlockingIOError):
-                while True:
-                    self.container.mux(self.stream.encode(sink.pull()))
         self.container.mux(self.stream.encode())
         self.container.close()
 
     def _begin(self, width: int, height: int) -> None:
-        encoding = ENCODINGS[self.form]
-        self.stream = self.container.add_stream(encoding.codec, rate=self.rate)
-        self.stream.width, self.stream.height, self.stream.pix_fmt = width, height, encoding.pixels
+        self.stream = self.container.add_stream(CODECS[self.form][0], rate=self.rate)
+        self.stream.width, self.stream.height, self.stream.pix_fmt = width, height, "yuv420p"
         if self.form == "webp":
             self.stream.options = {"quality": str(max(100 - 2 * self.quality, 0)), "compression_level": "6"}
         if self.form == "mp4":
@@ -152,21 +126,6 @@ class _Encoder:
             context, colors = self.stream.codec_context, self.av.video.reformatter
             context.colorspace, context.color_range = colors.Colorspace.ITU709, colors.ColorRange.MPEG
             context.color_primaries, context.color_trc = colors.ColorPrimaries.BT709, colors.ColorTrc.BT709
-
-    def _palette(self, frame: Any) -> tuple[Any, Any]:
-        """Where images go in, and where they come out with the one palette of all of them."""
-        graph = self.graph = self.av.filter.Graph()  # kept alive: it owns both ends
-        size = {"width": frame.width, "height": frame.height}
-        source = graph.add_buffer(**size, format=frame.format, time_base=frame.time_base)
-        split, palette, use = graph.add("split"), graph.add("palettegen"), graph.add("paletteuse", "dither=bayer")
-        sink = graph.add("buffersink")
-        source.link_to(split)
-        split.link_to(palette, 0, 0)
-        split.link_to(use, 1, 0)
-        palette.link_to(use, 0, 1)
-        use.link_to(sink)
-        graph.configure()
-        return source, sink
 
 
 def _rate(fps: float) -> Fraction:

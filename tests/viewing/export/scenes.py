@@ -63,7 +63,9 @@ def make_scene(
         for name, view in zip(cameras, views, strict=True)
     ]
     cameras = {camera.name: camera for camera in made}
-    recording = Recording(name, cameras, tuple(range(FRAMES)), (FRAMES - 1) / DURATION, KeptImages(cameras))
+    recording = Recording(
+        "tiny" if name != NASTY else name, cameras, tuple(range(FRAMES)), (FRAMES - 1) / DURATION, KeptImages(cameras)
+    )
     *train, held_out = cameras
     return export_scene(ViewedRun(name, recording, tuple(train), (held_out,), make_adapter(model)))
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
-from typing import get_args, get_type_hints
 
 import pytest
 import torch
@@ -16,7 +15,6 @@ from d2_plugin.commands.cli import main
 from d2_plugin.recordings.export.folder import save_recording
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.runs.run import Run
-from d2_plugin.viewing.export.export import FORMATS, Export
 
 
 @pytest.fixture(scope="module")
@@ -45,19 +43,19 @@ def test_a_run_becomes_a_page_of_a_stated_size(
     assert [camera["held_out"] for camera in header["cameras"]] == [False, False, False, True]
     assert "the learnt background, in every direction" in said
     background = Run.load(trained / backbone).trained().model.background
-    assert header["background"] == torch.cat([background.constant, background.harmonics]).tolist()
+    assert header["models"][0]["background"] == torch.cat([background.constant, background.harmonics]).tolist()
 
 
 def test_frames_are_chosen_by_number(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = str(trained / "yang4d")
-    assert main(["export", run, "--format", "spz", "--frames", "0:2:2"]) == 0
-    folder = trained / "yang4d" / "export" / "spz"
-    assert sorted(path.name for path in folder.iterdir()) == ["frame_00000.spz", "frame_00002.spz"]
+    assert main(["export", run, "--format", "ply", "--frames", "0:2:2"]) == 0
+    folder = trained / "yang4d" / "export" / "ply"
+    assert sorted(path.name for path in folder.iterdir()) == ["frame_00000.ply", "frame_00002.ply"]
     said = capsys.readouterr().out
     assert f"2 files in {folder}" in said
     assert "the background behind the Gaussians is left out" in said
     assert "no frame 7: it has 0 to 2" in refused(capsys, "export", run, "--format", "ply", "--frames", "7")
-    assert "--frames is for ply and spz" in refused(capsys, "export", run, "--frames", "1")
+    assert "--frames is for ply, sog, spz, glb" in refused(capsys, "export", run, "--frames", "1")
     assert "--frames" in refused(capsys, "export", run, "--format", "ply", "--frames", "")
 
 
@@ -73,7 +71,7 @@ def test_what_cannot_be_exported_is_one_sentence(
     trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = trained / "yang4d"
-    assert "splatv" in refused(capsys, "export", run, "--format", "splat")
+    assert "4dgs" in refused(capsys, "export", run, "--format", "splatv")
     assert "holds no run" in refused(capsys, "export", tmp_path)
     copy = Path(shutil.copytree(run, tmp_path / "run"))
     (copy / "checkpoint.pt").write_bytes((copy / "checkpoint.pt").read_bytes()[:1000])
@@ -84,5 +82,16 @@ def test_what_cannot_be_exported_is_one_sentence(
     assert "has no Gaussian left at step 4" in refused(capsys, "export", emptied(run, tmp_path / "empty"))
 
 
-def test_the_formats_that_are_declared_are_those_that_are_written() -> None:
-    assert set(get_args(get_type_hints(Export)["format"])) == set(FORMATS)
+def test_two_runs_become_one_page_by_export_and_by_compare(
+    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    runs = [str(trained / name) for name in ("yang4d", "deform")]
+    assert main(["export", *runs, "--output", str(tmp_path)]) == 0
+    assert main(["compare", *runs, "--page", str(tmp_path / "compared.html")]) == 0
+    assert f"Page: {tmp_path / 'compared.html'}" in capsys.readouterr().out
+    for name in ("scene.html", "compared.html"):
+        header = ReadPage(tmp_path / name).header
+        assert [model["name"] for model in header["models"]] == ["yang4d", "deform"]
+        assert header["models"][0]["scores"].keys() == {"", "test0"}
+        assert list(header["recorded"]) == ["test0"]
+    assert "give one, or for a page" in refused(capsys, "export", *runs, "--format", "ply")

@@ -2,94 +2,140 @@
 "use strict";
 
 const byId = (id) => document.getElementById(id);
+const RECORDED = "recorded";
+const LEAST_SHAPE = 0.8;      // width / height of the image on a tall screen: more height would show what nobody recorded
+const ORBIT_SECONDS = 16;     // of one swing
+const FLIGHT = 0.5;           // parts of the distance to what is looked at, in a second
+const KEYS_OF_FLIGHT = {
+  a: [-1, 0, 0], d: [1, 0, 0], q: [0, 1, 0], e: [0, -1, 0], w: [0, 0, 1], s: [0, 0, -1],
+};
+const KEYS_OF_ORBIT = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
 
 class Player {
   constructor(header, raw) {
     this.header = header;
-    this.scene = new Scene(header, raw);
-    this.renderer = new Renderer(byId("image"), this.scene);
+    this.renderer = new Renderer(byId("image"), header, raw);
     this.camera = new FreeCamera(header);
+    this.photos = new Photos(header, raw, () => this.change());
     this.time = 0;
     this.mode = "color";
-    this.speed = 1;
-    this.playing = false;
-    this.busy = false;       // the worker sorts
-    this.wanted = true;      // something changed since the last image
+    this.wipe = 0.5;
+    this.held = new Set();   // keys
     this.pace = new Pace();
-    this.coarse = 2;         // pixels of the screen per pixel of the image, while something moves
-    this.drawnSharp = false; // the last image has all pixels of the screen
-    this.images = 0;       // drawn so far
-    this.waiting = null;
-    this.startWorker(raw);
+    this.wanted = true;      // something changed since the last image
+    const code = new Blob([byId("worker").textContent], { type: "text/javascript" });
+    this.worker = new Worker(URL.createObjectURL(code));
+    this.worker.postMessage({ header, raw });
+    this.worker.onerror = (event) => fail(`the sorting of Gaussians failed: ${event.message}`);
+    this.worker.onmessage = ({ data }) => this.draw(data);
     this.fillPage();
     this.listen();
-    this.camera.place(header.cameras[0]);
+    this.begin();
     this.last = performance.now();
     requestAnimationFrame((now) => this.tick(now));
   }
 
-  startWorker(raw) {
-    const code = new Blob([byId("worker").textContent], { type: "text/javascript" });
-    this.worker = new Worker(URL.createObjectURL(code));
-    this.worker.postMessage({ header: this.header, raw });
-    this.worker.onerror = (event) => fail(`the sorting of Gaussians failed: ${event.message}`);
-    this.worker.onmessage = ({ data }) => this.draw(data);
-  }
-
   // Names come from files and are only ever set as text.
   fillPage() {
-    const { header } = this, still = header.seconds.length < 2;
-    document.title = header.name;
-    byId("name").textContent = header.name;
-    for (const [held, label] of [[false, "training cameras"], [true, "held-out cameras"]]) {
-      const cameras = header.cameras.map((camera, i) => [camera, i]).filter(([camera]) => camera.held_out === held);
-      if (!cameras.length) continue;
-      const group = byId("camera").appendChild(document.createElement("optgroup"));
+    const { header } = this, { models, cameras, recorded } = header;
+    document.title = byId("name").textContent = byId("heading").textContent = header.name;
+    for (const [held, label] of [[true, "held-out cameras"], [false, "training cameras"]]) {
+      const group = document.createElement("optgroup");
       group.label = label;
-      for (const [camera, i] of cameras) group.appendChild(new Option(camera.name, i));
+      cameras.forEach((camera, i) => { if (camera.held_out === held) group.appendChild(new Option(camera.name, i)); });
+      if (group.children.length) byId("camera").appendChild(group);
     }
     for (const line of header.about) byId("facts").appendChild(document.createElement("li")).textContent = line;
+    for (const side of ["left", "right"]) {
+      models.forEach(({ name }, i) => byId(side).appendChild(new Option(name, i)));
+      if (Object.keys(recorded).length) byId(side).appendChild(new Option(RECORDED, RECORDED));
+    }
+    byId("sides").hidden = byId("left").length < 2;
     byId("time").max = header.duration;
     byId("time").step = header.duration / 1000 || 1;
-    for (const id of ["play", "time", "speed"]) byId(id).disabled = still;
-    const scale = byId("scale").getContext("2d"), colors = header.palette;
+    for (const id of ["play", "time", "speed"]) byId(id).disabled = header.seconds.length < 2;
+    const scale = byId("scale").getContext("2d");
     for (let i = 0; i < 256; i++) {
-      scale.fillStyle = `#${colors.slice(6 * i, 6 * i + 6)}`;
+      scale.fillStyle = `#${header.palette.slice(6 * i, 6 * i + 6)}`;
       scale.fillRect(i, 0, 1, 1);
     }
-    byId("nearest").textContent = header.depth_range[0].toPrecision(3);
-    byId("farthest").textContent = header.depth_range[1].toPrecision(3);
-    this.showTime();
+    [byId("nearest").textContent, byId("farthest").textContent] = header.depth_range.map((depth) => depth.toPrecision(3));
   }
 
   listen() {
     const on = (id, name, act) => byId(id).addEventListener(name, act);
-    listen(byId("image"), this.camera, () => this.change());
-    on("play", "click", () => this.play(!this.playing));
+    const pressed = (id, to) => byId(id).setAttribute(id === "orbit" ? "aria-pressed" : "aria-expanded", to);
+    this.acts = {
+      play: () => this.play(!this.playing),
+      orbit: () => this.swing(!this.swinging),
+      link: () => this.share(),
+      save: () => this.save(),
+      full: () => (document.fullscreenElement ? document.exitFullscreen() : document.documentElement.requestFullscreen()),
+      about: () => { pressed("about", !(byId("notes").hidden = !byId("notes").hidden)); this.acts.more(false); },
+      more: (on) => pressed("more", byId("rest").classList.toggle("open", on)),
+    };
+    for (const [id, act] of Object.entries(this.acts)) on(id, "click", () => act());
+    listen(byId("image"), this.camera, () => { this.swing(false); this.change(); });
     on("time", "input", () => { this.play(false); this.goTo(Number(byId("time").value)); });
-    on("speed", "change", () => { this.speed = Number(byId("speed").value); });
     on("mode", "change", () => this.setMode(byId("mode").value));
-    on("camera", "change", () => { this.camera.place(this.header.cameras[byId("camera").value]); this.change(); });
-    on("back", "click", () => { this.camera.place(this.camera.camera); this.change(); });
-    on("save", "click", () => this.save());
-    on("about", "click", () => { byId("notes").hidden = !byId("notes").hidden; });
+    on("camera", "change", () => this.standAt(byId("camera").value));
+    for (const id of ["left", "right", "wipe"]) on(id, "input", () => this.change());
     addEventListener("resize", () => this.change());
     addEventListener("keydown", (event) => this.key(event));
+    addEventListener("keyup", (event) => this.held.delete(event.key));
+    addEventListener("blur", () => this.held.clear());
+  }
+
+  // As the link says, or at the held-out camera nearest to home where there is something to compare, else at home.
+  begin() {
+    const { header } = this, given = new URLSearchParams(location.hash.slice(1)), number = (name) => Number(given.get(name)) || 0;
+    const far = header.cameras.map(({ held_out: held, name, ...camera }) => {
+      this.camera.place(camera);
+      return held && header.recorded[name] ? Math.hypot(...plus(this.camera.centre, this.camera.home.centre, -1)) : Infinity;
+    });
+    const compared = Math.min(...far) < Infinity ? far.indexOf(Math.min(...far)) : -1;
+    byId("left").value = given.get("left") || (header.models.length > 1 || compared < 0 ? 0 : RECORDED);
+    byId("right").value = given.get("right") || header.models.length - 1;
+    for (const side of ["left", "right"]) if (byId(side).selectedIndex < 0) byId(side).selectedIndex = 0;
+    byId("wipe").value = given.get("wipe") || 0.5;
+    this.standAt(given.get("camera") || (compared < 0 ? "home" : String(compared)));
+    const pose = (given.get("pose") || "").split(",").map(Number);
+    if (pose.length === 15 && pose.every(Number.isFinite)) {
+      const [centre, focus] = [pose.slice(0, 3), pose.slice(3, 6)], axes = [6, 9, 12].map((at) => pose.slice(at, at + 3));
+      Object.assign(this.camera, { centre, focus, axes });
+      this.camera.keepInside(true);
+    }
+    this.setMode(MODES.includes(given.get("mode")) ? given.get("mode") : "color");
+    this.goTo(number("time"));
+  }
+
+  // The address of this page as it is seen now; set, and copied where the browser allows it.
+  share() {
+    const { camera } = this, values = ["left", "right", "wipe", "camera", "mode"].map((id) => [id, byId(id).value]);
+    if (camera.moved) {
+      values.push(["pose", [...camera.centre, ...camera.focus, ...camera.axes.flat()].map((v) => +v.toFixed(5)).join(",")]);
+    }
+    location.hash = new URLSearchParams([...values, ["time", this.time.toFixed(3)]]);
+    if (navigator.clipboard) navigator.clipboard.writeText(location.href).catch(() => {});
   }
 
   key(event) {
-    if (["INPUT", "SELECT", "BUTTON"].includes(event.target.tagName) && event.key === " ") return;
+    const { tagName, type } = event.target, { key } = event;
+    if (event.ctrlKey || event.metaKey || event.altKey || tagName === "SELECT") return;
+    if ((type === "range" && key.startsWith("Arrow")) || (tagName === "BUTTON" && key === " ")) return;
+    const modes = [...byId("mode").options].map((option) => option.value);
     const acts = {
-      " ": () => this.play(!this.playing),
+      " ": this.acts.play, o: this.acts.orbit, f: this.acts.full, h: () => this.standAt("home"),
       ".": () => this.step(1), ",": () => this.step(-1),
-      d: () => this.setMode(this.mode === "depth" ? "color" : "depth"),
+      c: () => this.setMode(modes[(modes.indexOf(this.mode) + 1) % modes.length]),
     };
-    if (!acts[event.key]) return;
+    if (!acts[key] && !KEYS_OF_FLIGHT[key] && !KEYS_OF_ORBIT[key]) return;
     event.preventDefault();
-    acts[event.key]();
+    if (acts[key]) acts[key]();
+    else this.held.add(key);
   }
 
-  change() { this.wanted = true; this.drawnSharp = false; this.touched = performance.now(); }
+  change() { this.wanted = true; this.sharp = false; this.touched = performance.now(); }
 
   play(on) {
     this.playing = on && this.header.duration > 0;
@@ -98,12 +144,24 @@ class Player {
     this.change();
   }
 
-  goTo(time) { this.time = Math.min(Math.max(time, 0), this.header.duration); this.showTime(); this.change(); }
+  swing(on) {
+    this.swinging = on;
+    this.phase = 0;
+    byId("orbit").setAttribute("aria-pressed", on);
+  }
+
+  standAt(value) {
+    const { cameras, home } = this.header;
+    this.swing(false);
+    this.camera.place(cameras[value] || home);
+    this.change();
+  }
+
+  goTo(time) { this.time = clamp(time, [0, this.header.duration]); this.change(); }
 
   step(frames) {
     this.play(false);
-    const place = Math.min(Math.max(this.frame() + frames, 0), this.header.seconds.length - 1);
-    this.goTo(this.header.seconds[place]);
+    this.goTo(this.header.seconds[clamp(this.frame() + frames, [0, this.header.seconds.length - 1])]);
   }
 
   frame() {
@@ -111,86 +169,111 @@ class Player {
     return apart.indexOf(Math.min(...apart));
   }
 
-  showTime() {
-    byId("time").value = this.time;
-    byId("clock").textContent = `${this.time.toFixed(2)} s · frame ${this.header.frames[this.frame()]}`;
-  }
-
   setMode(mode) {
-    this.mode = mode;
-    byId("mode").value = mode;
+    this.mode = byId("mode").value = mode;
     byId("legend").hidden = mode !== "depth";
     this.change();
   }
 
   tick(now) {
-    const passed = Math.min(Math.max((now - this.last) / 1000, 0), 0.25);
+    const passed = clamp((now - this.last) / 1000, [0, 0.25]), moving = this.playing || this.swinging || this.held.size > 0;
     this.last = now;
     if (this.playing) {
-      const { duration } = this.header, next = this.time + passed * this.speed;
-      this.time = next > duration ? 0 : next;
-      this.showTime();
-      this.wanted = true;
+      const next = this.time + passed * Number(byId("speed").value);
+      this.time = next > this.header.duration ? 0 : next;
     }
-    const quiet = !this.playing && now - (this.touched || 0) > 300;
-    const due = this.wanted || (quiet && !this.drawnSharp);
-    if (due && !this.busy && !this.waiting) {
-      this.drawnSharp = quiet || this.coarse === 1;
-      this.sort(this.screenView(quiet ? 1 : this.coarse));
+    if (this.swinging) this.camera.swing(this.phase += (2 * Math.PI * passed) / ORBIT_SECONDS);
+    for (const key of this.held) {
+      const turn = KEYS_OF_ORBIT[key];
+      if (turn) this.camera.orbit(...turn.map((part) => part * passed));
+      else this.camera.fly(KEYS_OF_FLIGHT[key].map((part) => part * passed * FLIGHT));
+    }
+    if (moving) this.change();
+    const quiet = !moving && now - this.touched > 300;
+    if ((this.wanted || (quiet && !this.sharp)) && !this.busy && !this.waiting) {
+      this.showControls();
+      this.sharp = quiet;
+      this.sort(this.screenView(quiet ? 1 : this.pace.coarse), this.sides());
     }
     requestAnimationFrame((next) => this.tick(next));
   }
 
-  screenView(coarse) {
-    const { clientWidth, clientHeight } = byId("stage"), ratio = devicePixelRatio / coarse;
-    return this.camera.view(Math.max(Math.round(clientWidth * ratio), 1), Math.max(Math.round(clientHeight * ratio), 1));
+  // What is shown on the left of the wipe and on its right; the recording only where it was made.
+  sides() {
+    const at = this.camera.standing, image = at && this.photos.at(at, this.time);
+    const chosen = ["left", "right"].map((id) => byId(id).value).filter((what) => what !== RECORDED || image);
+    const shown = [...new Set(chosen.length ? chosen : [this.header.models.length - 1])];
+    const { clientWidth: width } = byId("wipe"), share = Number(byId("wipe").value);
+    const until = width > 44 ? (22 + share * (width - 44)) / width : share;  // where the middle of its knob stands
+    return shown.map((what, i) => ({
+      what: what === RECORDED ? { image, size: [at.width, at.height] } : Number(what), until: i + 1 < shown.length ? until : 1,
+    }));
   }
 
-  sort(view) {
+  showControls() {
+    const { header, camera } = this, sides = this.sides(), at = camera.standing;
+    byId("time").value = this.time;
+    byId("clock").firstChild.data = `${this.time.toFixed(2)} s`;
+    byId("clock").lastChild.textContent = ` · frame ${header.frames[this.frame()]}`;
+    byId("camera").value = at ? header.cameras.indexOf(at) : "home";
+    byId("wipe").hidden = sides.length < 2;
+    byId("stage").style.setProperty("--edge", camera.edge);
+    const said = sides.map(({ what }) => {
+      if (typeof what !== "number") return "recorded";
+      const { name, scores } = header.models[what], score = scores[at ? at.name : ""];
+      return score === undefined ? name : `${name}\n${score.toFixed(1)} dB ${at ? "at this camera" : "held out"}`;
+    });
+    byId("leftside").textContent = said.length > 1 || header.models.length > 1 || at ? said[0] : "";
+    byId("rightside").textContent = said[1] || "";
+  }
+
+  // The view for the stage, with as many pixels as the screen has, or fewer by `coarse` each way.
+  screenView(coarse) {
+    const { clientWidth, clientHeight } = byId("stage"), { width, height } = this.camera.camera;
+    const most = Math.max(width / height, LEAST_SHAPE), ratio = devicePixelRatio / coarse;
+    const tall = Math.min(clientHeight, clientWidth / LEAST_SHAPE), wide = Math.min(clientWidth, tall * most);
+    byId("stage").style.setProperty("--wide", `${wide}px`);
+    byId("stage").style.setProperty("--tall", `${tall}px`);
+    return this.camera.view(Math.max(Math.round(wide * ratio), 1), Math.max(Math.round(tall * ratio), 1));
+  }
+
+  sort(view, sides) {
     this.busy = true;
     this.wanted = false;
-    this.asked = { view, time: this.time, mode: this.mode, start: performance.now() };
-    this.worker.postMessage({ forward: view.rotation.slice(6, 9), offset: view.translation[2], time: this.time });
+    this.asked = { view, sides, time: this.time, mode: this.mode, start: performance.now() };
+    const shown = sides.map(({ what }) => what).filter((what) => typeof what === "number");
+    this.worker.postMessage({ shown, forward: view.rotation.slice(6, 9), offset: view.translation[2], time: this.time });
+    this.asked.shown = shown;
   }
 
-  draw({ order, count }) {
-    const { view, time, mode, start } = this.asked;
-    this.renderer.setOrder(order, count);
-    this.renderer.draw(view, time, mode);
-    this.images++;
+  draw(orders) {
+    const { view, sides, shown, time, mode, start } = this.asked, { gl } = this.renderer;
+    shown.forEach((place, i) => this.renderer.models[place].setOrder(orders[i]));
+    this.renderer.draw(view, time, mode, sides);
+    gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4));  // waits until it is drawn
     this.busy = false;
-    if (this.waiting) {
-      this.renderer.gl.finish();
-      this.waiting();
-      this.waiting = null;
-    } else {
-      this.adapt(view.size[0] * view.size[1], start);
-    }
+    if (this.waiting) this.waiting();
+    else this.pace.note(view.size[0] * view.size[1], (performance.now() - start) / 1000, this.screenView(1).size);
+    this.waiting = null;
   }
 
-  // A machine without a graphics card draws fewer pixels while something moves; at rest it draws all.
-  adapt(pixels, start) {
-    this.renderer.gl.readPixels(0, 0, 1, 1, this.renderer.gl.RGBA, this.renderer.gl.UNSIGNED_BYTE, new Uint8Array(4));
-    this.pace.note(pixels, (performance.now() - start) / 1000);
-    const { size } = this.screenView(1);
-    this.coarse = this.pace.coarse(size[0] * size[1], this.coarse);
-  }
-
-  // The image of a camera of the recording at a time, in the camera's own size, as the address of a PNG.
-  async image(name, time, mode = "color") {
+  // The image of a camera of the recording at a time, in the camera's own size, as the address of a PNG; `what` is the
+  // number of a model, or "recorded".
+  async image(name, time, mode = "color", what = this.header.models.length - 1) {
     const camera = this.header.cameras.find((other) => other.name === name);
     if (!camera) throw new Error(`no camera '${name}'`);
     const free = new FreeCamera(this.header);
     free.place(camera);
-    return this.still(free.view(camera.width, camera.height), time, mode);
+    const shown = what === RECORDED ? { image: await this.photos.ready(camera, time), size: [camera.width, camera.height] } : what;
+    return this.still(free.view(camera.width, camera.height), time, mode, [{ what: shown, until: 1 }]);
   }
 
-  async still(view, time, mode) {
+  async still(view, time, mode, sides) {
     this.play(false);
     while (this.busy) await new Promise((resolve) => setTimeout(resolve, 1));
     const before = [this.time, this.mode];
     [this.time, this.mode] = [time, mode];
-    await new Promise((resolve) => { this.waiting = resolve; this.sort(view); });
+    await new Promise((resolve) => { this.waiting = resolve; this.sort(view, sides); });
     const address = byId("image").toDataURL("image/png");
     [this.time, this.mode] = before;
     this.change();
@@ -199,9 +282,37 @@ class Player {
 
   async save() {
     const link = document.createElement("a");
-    link.href = await this.still(this.screenView(1), this.time, this.mode);
+    link.href = await this.still(this.screenView(1), this.time, this.mode, this.sides());
     link.download = `${this.header.name.replace(/[^\w.-]+/g, "_")}_${this.time.toFixed(2)}s.png`;
     link.click();
+  }
+}
+
+// The recorded images of one camera after the other: all of it are decoded when one is asked for.
+class Photos {
+  constructor(header, raw, changed) { Object.assign(this, { header, raw, changed, decoded: [] }); }
+
+  load(camera) {
+    if (this.camera === camera) return this.loaded;
+    const kept = this.header.recorded[camera.name] || [], blob = ([, at, length]) => new Blob([this.raw.slice(at, at + length)]);
+    Object.assign(this, { camera, decoded: [] });
+    this.loaded = Promise.all(kept.map((entry) => createImageBitmap(blob(entry)))).then((images) => {
+      if (this.camera === camera) this.decoded = images.map((image, i) => ({ image, time: this.header.seconds[kept[i][0]] }));
+      this.changed();
+    });
+    return this.loaded;
+  }
+
+  // The image nearest in time; none before it is there.
+  at(camera, time) {
+    this.load(camera);
+    const apart = this.decoded.map((photo) => Math.abs(photo.time - time));
+    return apart.length ? this.decoded[apart.indexOf(Math.min(...apart))].image : null;
+  }
+
+  async ready(camera, time) {
+    await this.load(camera);
+    return this.at(camera, time);
   }
 }
 
@@ -211,17 +322,19 @@ function fail(message) {
 }
 
 async function start() {
+  clearInterval(loading);
   const header = JSON.parse(byId("header").textContent);
   if (typeof DecompressionStream === "undefined") {
     throw new Error("this browser cannot unpack the data: open the page in a Chrome, Firefox, Safari or Edge of 2023 or later");
   }
-  const text = atob(byId("data").textContent.trim()), bytes = new Uint8Array(text.length);
-  for (let i = 0; i < text.length; i++) bytes[i] = text.charCodeAt(i);
+  byId("clock").append("", Object.assign(document.createElement("span"), { className: "frame" }));
+  await new Promise((resolve) => setTimeout(resolve));  // show what stands there so far
+  const text = atob(byId("data").textContent.trim()), bytes = Uint8Array.from(text, (letter) => letter.charCodeAt(0));
   byId("data").remove();
   const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"));
   const player = new Player(header, await new Response(stream).arrayBuffer());
   byId("message").hidden = true;
-  if (!matchMedia("(prefers-reduced-motion: reduce)").matches) player.play(true);
+  if (!location.hash && !matchMedia("(prefers-reduced-motion: reduce)").matches) player.play(true);
   return player;
 }
 

@@ -1,19 +1,15 @@
-// The scene of this page, decoded. Runs in the page and in the worker; see codes.py and page.py for what is stored.
+// One model of this page, decoded. Runs in the page and in the worker; see coded.py and page.py for what is stored.
 "use strict";
 
 class Scene {
-  // header: the table of the page; raw: ArrayBuffer of all coded arrays behind each other.
-  constructor(header, raw) {
-    this.header = header;
-    this.raw = raw;
-    this.count = header.count;
-    this.entries = new Map(header.arrays.map((entry) => [entry.name, entry]));
-    this.keyTimes = header.keys ? header.keys.times : [0];
-    const still = this.has("positions_0") ? 0 : null;
+  // header: the table of the page; model: one of its models; raw: ArrayBuffer of all coded arrays behind each other.
+  constructor(header, model, raw) {
+    Object.assign(this, { header, model, raw, count: model.count });
+    this.entries = new Map(model.arrays.map((entry) => [entry.name, entry]));
+    this.keyTimes = model.keys ? model.keys : [0];
     this.base = { positions: this.array("positions"), shapes: this.shapes("shapes"), opacities: this.array("opacities") };
-    this.lines = header.motion === "lines" ? this.decodeLines() : null;
-    this.kept = new Map();
-    if (still === null) this.kept.set(0, this.base);
+    this.lines = model.motion === "lines" ? this.decodeLines() : null;
+    this.kept = new Map(this.has("positions_0") ? [] : [[0, this.base]]);
   }
 
   has(name) { return this.entries.has(name); }

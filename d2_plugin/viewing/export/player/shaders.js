@@ -140,19 +140,18 @@ void main() { gl_Position = vec4(float(gl_VertexID & 1) * 4. - 1., float(gl_Vert
 
 const FINISH_FRAGMENT = `#version 300 es
 precision highp float;
-uniform sampler2D sums, palette;
-uniform int mode;              // 0 colour, 1 depth, 2 opacity
-uniform vec2 size, focal, principal, depthRange;
+uniform sampler2D sums, palette, photo;
+uniform int mode;              // 0 colour, 1 depth, 2 opacity, 3 the recorded image
+uniform vec2 size, focal, principal, depthRange, photoSize;
 uniform mat3 rotation;
-uniform float depthUnit;
+uniform float depthUnit, photoScale;
 uniform bool hasSky;
 uniform vec3 sky[16];
 out vec4 result;
 
 ${HARMONICS}
 
-vec3 behind() {
-  vec2 pixel = vec2(gl_FragCoord.x, size.y - gl_FragCoord.y);
+vec3 behind(vec2 pixel) {
   float values[16];
   harmonics(normalize(transpose(rotation) * vec3((pixel - principal) / focal, 1.)), values);
   vec3 color = vec3(0.5);
@@ -161,9 +160,14 @@ vec3 behind() {
 }
 
 void main() {
+  vec2 pixel = vec2(gl_FragCoord.x, size.y - gl_FragCoord.y);
+  if (mode == 3) {  // whose middle is that of the image
+    result = vec4(texture(photo, 0.5 + (pixel - 0.5 * size) / (photoScale * photoSize)).rgb, 1.);
+    return;
+  }
   vec4 sum = texelFetch(sums, ivec2(gl_FragCoord.xy), 0);
   vec3 color = sum.rgb;
-  if (mode == 0 && hasSky) color += (1. - sum.a) * behind();
+  if (mode == 0 && hasSky && sum.a < 0.999) color += (1. - sum.a) * behind(pixel);
   if (mode == 1) {
     float depth = sum.r / max(sum.a, 1e-4) * depthUnit;
     float place = clamp((depth - depthRange.x) / max(depthRange.y - depthRange.x, 1e-12), 0., 1.);

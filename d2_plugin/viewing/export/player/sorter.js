@@ -1,26 +1,24 @@
 // The worker: which Gaussians are to be drawn at a time, from the farthest to the nearest.
 "use strict";
 
-let scene = null;
-let rows, depths, keys, spareRows, spareKeys;
+let models = [];
 
 onmessage = ({ data }) => {
   if (data.header) {
-    scene = new Scene(data.header, data.raw);
-    rows = new Uint32Array(scene.count);
-    depths = new Float32Array(scene.count);
-    keys = new Uint32Array(depths.buffer);
-    spareRows = new Uint32Array(scene.count);
-    spareKeys = new Uint32Array(scene.count);
+    models = data.header.models.map((model) => {
+      const scene = new Scene(data.header, model, data.raw), fresh = () => new Uint32Array(scene.count);
+      const depths = new Float32Array(scene.count);
+      return { scene, depths, rows: fresh(), keys: new Uint32Array(depths.buffer), spareRows: fresh(), spareKeys: fresh() };
+    });
     return;
   }
-  const count = gather(data), order = farToNear(count);
-  postMessage({ order, count }, [order.buffer]);
+  const orders = data.shown.map((place) => farToNear(models[place], gather(models[place], data)));
+  postMessage(orders, orders.map(({ order }) => order.buffer));
 };
 
 // Writes the rows that are seen and their depths; returns their number. forward, offset: depth = forward . x + offset.
-function gather({ forward: [fx, fy, fz], offset, time }) {
-  const { key, share } = scene.place(time), { near, alpha_min: least } = scene.header.raster;
+function gather({ scene, rows, depths }, { forward: [fx, fy, fz], offset, time }) {
+  const { key, share } = scene.place(time), { near, alpha_min: least } = scene.model.raster;
   const from = scene.state(key), to = scene.state(key + 1), lines = scene.lines;
   const p = from.positions, q = to.positions, cut = scene.header.marginal_cut;
   let found = 0;
@@ -47,11 +45,11 @@ function gather({ forward: [fx, fy, fz], offset, time }) {
 }
 
 // Radix sort by the bits of the depth, which for positive floats are in the order of the depths; 16 bits at a time.
-function farToNear(count) {
+function farToNear({ rows, keys, spareRows, spareKeys }, count) {
   const order = new Uint32Array(4096 * Math.max(Math.ceil(count / 4096), 1));  // whole rows of texels
   pass(rows, keys, spareRows, spareKeys, count, 0);
   pass(spareRows, spareKeys, order, keys, count, 16);
-  return order;
+  return { order, count };
 }
 
 function pass(fromRows, fromKeys, toRows, toKeys, count, shift) {
