@@ -115,8 +115,8 @@ def check_device(splats: Splats, view: View) -> None:
 
 
 def check_prior(prior: object, name: str) -> str:
-    """Refuse what a store gave and is no prior; returns what is wrong with its pixels, in a sentence that begins with
-    `name`, or nothing."""
+    """Refuse what a store gave and is no prior, with unknown labels or without a depth at most of the pixels that claim
+    one; returns what is wrong with the others, in a sentence that begins with `name`, or nothing."""
     if not isinstance(prior, DepthPrior):
         raise D2Error(
             f"{name} is a {type(prior).__name__}, expected d2_plugin.protocol.DepthPrior or None: mend prior() of the "
@@ -127,25 +127,25 @@ def check_prior(prior: object, name: str) -> str:
         raise D2Error(f"{name} has no depth as a map [H, W] of floating-point numbers: give tensors")
     if any(part is not None and part.shape[:2] != depth.shape for part in (labels, *others)):
         raise D2Error(f"{name} has maps of several sizes: give all of them {tuple(depth.shape)} as its depth")
-    fits = (depth > 0) & (depth < torch.inf) | (labels == Label.EMPTY) | (labels == Label.CONFLICT)
-    unknown = labels.byte() > max(Label)
-    if bool(fits.all()) and not bool(unknown.any()):
-        return ""
-    return (
-        f"{name} has {int(unknown.sum())} labels that are none of 0 to {int(max(Label))}, and {int((~fits).sum())} "
-        "pixels whose label says that a depth is known and whose depth is NaN, infinite or not above 0: none is used"
-    )
+    known = (labels != Label.EMPTY) & (labels != Label.CONFLICT)
+    wrong = known & ~((depth > 0) & (depth < torch.inf) & (prior.sigma is None or prior.sigma >= 0))
+    claimed, flawed, unknown = (int(mask.sum()) for mask in (known, wrong, labels.byte() > max(Label)))
+    says = f"of {claimed} pixels labelled with a known depth {flawed} have NaN, infinity, 0 or less, or no such sigma"
+    if unknown or 2 * flawed > claimed:
+        last = int(max(Label))
+        raise D2Error(
+            f"{name} has {unknown} labels that are none of 0 to {last}, and {says}: mend prior() of the store"
+        )
+    return f"{name}: {says}; these count as empty" if flawed else ""
 
 
 def check_inserted(added: object, asked: int, grown: int) -> None:
-    """Refuse what `insert` returned where the number of Gaussians did not grow by it; warn where that is none."""
+    """Refuse what `insert` returned where the number of Gaussians did not grow by it."""
     if isinstance(added, bool) or not isinstance(added, int) or added != grown or not 0 <= added <= asked:
         raise D2Error(
             f"insert() was given {asked} points and returned {shown(added)}, and the backbone has {grown} Gaussians "
             "more: return how many were added"
         )
-    if asked and not added:
-        _log.warning("insert() of the backbone added none of %d points: densify had no effect in this step", asked)
 
 
 def small_image(backbone: Backbone, camera: object) -> Tensor | None:

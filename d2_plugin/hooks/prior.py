@@ -176,6 +176,8 @@ class Kept(NamedTuple):
         """What of a prior may be used; in memory that a GPU copies from without a wait, where `pin` is set."""
         maps, coded = believed(read.codes, belief), read.range is not None
         empty = torch.zeros_like(maps.far) if coded else ~(torch.isfinite(maps.depth) & (maps.depth > 0))
+        if maps.sigma is not None and not coded:
+            empty |= ~(maps.sigma >= 0)
         if bool(maps.far.any()):
             empty |= _outline(maps.far)
         maps = maps._replace(labels=maps.labels.masked_fill(empty, int(Label.EMPTY)))
