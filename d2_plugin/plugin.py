@@ -103,6 +103,7 @@ class D2Hooks:
         self.prior: PriorLoader | None = None
         """Where the hooks look up depth; None where there is no hook."""
         if self.hooks:
+            check_surroundings()
             from d2_plugin.store.exported import renamed_by
 
             opened = store if store is not None else _open_store(config, self.hooks)

@@ -220,6 +220,8 @@ class PriorLoader:
         self, store: Store, memory_mb: int = 2048, rename: Rename | None = None, believe: Belief = "all"
     ) -> None:
         """`memory_mb`: what the priors that are kept may take; the one in use is kept whatever it takes."""
+        if not hasattr(store, "prior"):
+            raise D2Error(f"the store is a {type(store).__name__} without prior(camera, frame): give one that has it")
         self.store, self.keep_bytes, self._rename, self.believe = store, memory_mb << 20, rename, believe
         # By camera and frame; frame + 0.5 is halfway to the next.
         self._kept: OrderedDict[tuple[str, float], Kept | None] = OrderedDict()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import os
 import signal
 import subprocess
@@ -56,6 +57,11 @@ def verified(prior: DepthPrior, depth: float) -> DepthPrior:
         (lambda prior: tuple(prior), "is a tuple, expected"),
         (lambda prior: prior._replace(labels=prior.labels[1:]), "has maps of several sizes"),
         (lambda prior: prior._replace(sigma=prior.depth[1:]), "has maps of several sizes"),
+        (lambda prior: prior._replace(sigma="x"), "give tensors"),
+        (lambda prior: prior._replace(depth=prior.depth.to("meta")), "give tensors"),
+        (lambda prior: prior._replace(depth=prior.depth.to_sparse()), "give tensors"),
+        (lambda prior: prior._replace(colors=torch.rand(24, 32, 3)), "give uint8"),
+        (lambda prior: prior._replace(reliability=-prior.depth), "reliability outside of 0..1"),
         (lambda prior: prior._replace(depth=prior.depth.numpy()), "has no depth as a map"),
         (lambda prior: prior._replace(depth=prior.depth.long()), "has no depth as a map"),
         (lambda prior: prior._replace(labels=torch.full_like(prior.labels, 9)), "has 768 labels that are none"),
@@ -79,7 +85,7 @@ def test_some_pixels_of_a_prior_that_cannot_be_are_counted_once_per_camera(
     assert caplog.text.count("of 744 pixels labelled with a known depth 1 have NaN") == 1
 
 
-@pytest.mark.parametrize("name", ["zeros", "mirrored", "scaled", "no last row", "K of zeros"])
+@pytest.mark.parametrize("name", ["zeros", "mirrored", "scaled", "no last row", "K of zeros", "K transposed"])
 def test_a_pose_that_cannot_be_is_refused(name: str) -> None:
     view, pose, K = VIEWS[0], torch.eye(4), VIEWS[0].K.clone()
     if name == "zeros":
@@ -90,10 +96,18 @@ def test_a_pose_that_cannot_be_is_refused(name: str) -> None:
         pose[:3, :3] *= 1.1
     elif name == "no last row":
         pose[3] = 0
-    else:
+    elif name == "K of zeros":
         K[2, 2] = 0
-    with pytest.raises(D2Error, match="is no rotation and shift, or the last row of it or K"):
+    else:
+        K[1, 0] = 5
+    with pytest.raises(D2Error, match="is no rotation and shift, or K has"):
         hooks().loss(1, replace(view, T_camera_world=pose, K=K))
+
+
+@pytest.mark.parametrize(("name", "value"), [("time", "x"), ("time", math.nan), ("frame", 0.5), ("camera", None)])
+def test_what_a_view_is_called_is_looked_at(name: str, value: object) -> None:
+    with pytest.raises(D2Error, match=f"the {name} of a view must be"):
+        hooks().loss(1, replace(VIEWS[0], **{name: value}))
 
 
 def test_a_step_that_falls_repeats_or_differs_is_named_once(caplog: pytest.LogCaptureFixture) -> None:
@@ -114,6 +128,11 @@ def test_a_step_that_falls_repeats_or_differs_is_named_once(caplog: pytest.LogCa
         caplog.clear()
         after(*wrong, *wrong)
         assert caplog.text.count("which rises from one to the next") == 1
+
+
+def test_a_store_without_priors_is_refused() -> None:
+    with pytest.raises(D2Error, match=r"the store is a object without prior\(camera, frame\)"):
+        hooks(object())
 
 
 class Lazy(Yang4DAdapter):
@@ -161,7 +180,11 @@ def default(dtype: torch.dtype) -> Iterator[None]:
 )
 def test_what_torch_does_to_every_tensor_is_refused_where_d2_cannot_work_with_it(around: Callable) -> None:
     d2 = hooks()
-    for call in (lambda: d2.loss(1, VIEWS[0]), lambda: d2.step(1)):
+    for call in (
+        lambda: d2.loss(1, VIEWS[0]),
+        lambda: d2.step(1),
+        lambda: D2Hooks(ALL_HOOKS, d2.backbone, TinyStore()),
+    ):
         with around(), pytest.raises(D2Error, match="D2 needs float32 as the default dtype"):
             call()
 
