@@ -24,6 +24,7 @@ from d2_plugin.commands.cli import main
 from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.moving import Harmonics, MovingGaussians
 from d2_plugin.reading import Unreadable, parse_json, parse_toml
+from d2_plugin.recordings.cameras.calibration import read_calibration
 from d2_plugin.recordings.cameras.formats.document import Document
 from d2_plugin.recordings.importing.settings import by_camera, finite
 from d2_plugin.recordings.importing.video import videos_below
@@ -112,6 +113,17 @@ def test_yaml_that_no_calibration_needs_is_refused(tmp_path: Path, text: str) ->
     (tmp_path / "rig.yml").write_text(text)
     with pytest.raises(D2Error):
         _ = Document(tmp_path / "rig.yml").content
+
+
+def test_a_sentence_that_repeats_a_damaged_file_is_short(tmp_path: Path) -> None:
+    camera = (
+        f"camera_model: pinhole\n  distortion_model: {'x' * 9000}\n  intrinsics: [9, 9, 9, 9]\n  resolution: [9, 9]"
+    )
+    (tmp_path / "camchain.yaml").write_text(f"cam0:\n  {camera}\n")
+    with pytest.raises(D2Error) as refusal:
+        read_calibration(tmp_path / "camchain.yaml")
+    assert len(str(refusal.value)) < 1300
+    assert str(refusal.value).endswith("calibrate it with Kalibr's pinhole-equi or pinhole-radtan")
 
 
 def test_a_name_that_stands_twice_is_named() -> None:
