@@ -239,6 +239,8 @@ def shared_rates(settings: SplatSettings, extent: float) -> dict[str, float]:
 
 
 def decayed_rate(first: float, last: float, step: int, iterations: int) -> float:
-    """Learning rate after `step` of `iterations`: exponential from `first` to `last`."""
+    """Learning rate after `step` of `iterations`: exponential from `first` to `last`; 0 where one of them is."""
+    if first * last == 0:
+        return 0.0
     fraction = min(step / max(iterations, 1), 1.0)
     return math.exp((1 - fraction) * math.log(first) + fraction * math.log(last))

@@ -15,6 +15,13 @@ class D2Error(ValueError):
     The `d2` command prints it without a traceback and exits with code 2.
     """
 
+    longest = 1200
+    """Letters of a sentence; of one that repeats a damaged file's, the middle is left out."""
+
+    def __str__(self) -> str:
+        text, end = super().__str__(), self.longest // 4
+        return text if len(text) <= self.longest else f"{text[: 3 * end]} ... {text[-end:]}"
+
 
 class MissingExtra(D2Error, ImportError):
     """A feature was asked for whose optional packages are not installed."""

@@ -94,7 +94,7 @@ class D2Hooks:
         self._order, self._used = StepOrder(), threading.Lock()
         self._evaluated = False
         self._count = len(backbone)
-        self._warned = False
+        self._warned = self._idle_insert = False
         self._inserting = 0  # the step while the backbone inserts for us, else 0
         self.inserted_at = torch.zeros(self._count, dtype=torch.int32)
         """Per Gaussian [N], the step at which D2 inserted it; 0 for the backbone's own."""
@@ -103,6 +103,7 @@ class D2Hooks:
         self.prior: PriorLoader | None = None
         """Where the hooks look up depth; None where there is no hook."""
         if self.hooks:
+            check_surroundings()
             from d2_plugin.store.exported import renamed_by
 
             opened = store if store is not None else _open_store(config, self.hooks)
@@ -312,6 +313,11 @@ class D2Hooks:
         finally:
             self._inserting = 0
         check_inserted(inserted, len(points.positions), len(self.backbone) - before)
+        if not inserted and len(points.positions) and not self._idle_insert:
+            self._idle_insert = True
+            _log.warning(
+                "insert() of the backbone added none of %d points: D2 densifies nothing", len(points.positions)
+            )
         self.trace.append(Trace(step, proposals[0][0], "insert", inserted))
         return inserted
 

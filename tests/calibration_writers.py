@@ -153,6 +153,69 @@ def panoptic(path: Path, cameras: Sequence[Known]) -> Path:
     return path / "calibration_dance.json"
 
 
+def qualisys(path: Path, cameras: Sequence[Known]) -> Path:
+    """QTM's XML, in 64ths of a pixel and millimetres, from a field of view that begins at 16, 8."""
+    entries = []
+    for camera in cameras:
+        k1, k2, p1, p2, k3 = camera.distortion
+        (width, height), gl, centre = camera.size, np.diag([1.0, -1, -1]) @ camera.R, -1000 * camera.R.T @ camera.t
+        fx, fy, cx, cy = (
+            64 * (value + more) for value, more in zip(camera.K[[0, 1, 0, 1], [0, 1, 2, 2]], (0, 0, 16, 8))
+        )
+        r = " ".join(f'r{i + 1}{j + 1}="{gl[i, j]!r}"' for i in range(3) for j in range(3))
+        x, y, z = map(float, centre)
+        entries.append(
+            f'<camera active="1" serial="{camera.name}" model="Miqus Video" viewrotation="0">'
+            f'<fov_video left="16" top="8" right="{width + 15}" bottom="{height + 7}"/>'
+            f'<transform x="{x}" y="{y}" z="{z}" {r.replace("np.float64(", "").replace(")", "")}/>'
+            f'<intrinsic focalLengthU="{fx}" focalLengthV="{fy}" centerPointU="{cx}" centerPointV="{cy}" skew="0"'
+            f' radialDistortion1="{k1}" radialDistortion2="{k2}" radialDistortion3="{k3}"'
+            f' tangentalDistortion1="{p1}" tangentalDistortion2="{p2}"/></camera>'
+        )
+    inactive = '<camera active="0" serial="other"/>'
+    text = f'<?xml version="1.0" encoding="ASCII"?>\n<calibration>\n<cameras>{"".join(entries)}{inactive}</cameras>'
+    (path / "Calib.qca.txt").write_text(f"{text}</calibration>")
+    return path / "Calib.qca.txt"
+
+
+def opencv_many(file: str) -> Writer:
+    """Writes what the multi-camera calibration of OpenCV's ccalib writes."""
+
+    def write(path: Path, cameras: Sequence[Known]) -> Path:
+        storage = cv2.FileStorage(str(path / file), cv2.FILE_STORAGE_WRITE)
+        storage.write("nCameras", len(cameras))
+        for number, camera in enumerate(cameras):
+            R = camera.R @ cameras[0].R.T
+            pose = np.eye(4)
+            pose[:3, :3], pose[:3, 3] = R, camera.t - R @ cameras[0].t
+            storage.write(f"camera_matrix_{number}", camera.K)
+            storage.write(f"camera_distortion_{number}", np.array([camera.distortion]))
+            storage.write(f"camera_pose_{number}", pose)
+        storage.write("meanReprojectError", 0.3)
+        storage.release()
+        return path / file
+
+    return write
+
+
+def opencv_stereo(path: Path, cameras: Sequence[Known]) -> Path:
+    """What OpenCV's `stereo_calib` writes of the first two cameras."""
+    files = [
+        cv2.FileStorage(str(path / f"{name}.xml"), cv2.FILE_STORAGE_WRITE) for name in ("intrinsics", "extrinsics")
+    ]
+    one, other = cameras[:2]
+    for number, camera in enumerate((one, other), start=1):
+        files[0].write(f"M{number}", camera.K)
+        files[0].write(f"D{number}", np.array([camera.distortion]))
+    R = other.R @ one.R.T
+    files[1].write("R", R)
+    files[1].write("T", (other.t - R @ one.t)[:, None])
+    files[1].write("Q", np.eye(4))
+    for file in files:
+        file.release()
+    return path / "intrinsics.xml"
+
+
 def transforms(path: Path, cameras: Sequence[Known]) -> Path:
     flip = np.diag([1.0, -1, -1])
     frames = []
@@ -276,6 +339,12 @@ CASES = {
     "multical": Case(multical, "multical"),
     "multical, rational": Case(multical, "multical", coefficients=8),
     "panoptic": Case(panoptic, "panoptic", names=("00_00", "00_01", "00_02")),
+    "qualisys": Case(qualisys, "qualisys"),
+    "opencv, xml": Case(opencv_many("multi.xml"), "opencv", relative=True, names=("cam0", "cam1", "cam2"), sizes=False),
+    "opencv, yaml": Case(
+        opencv_many("multi.yml"), "opencv", coefficients=8, relative=True, names=("cam0", "cam1", "cam2"), sizes=False
+    ),
+    "opencv, stereo": Case(opencv_stereo, "opencv", relative=True, names=("cam1", "cam2"), sizes=False),
     "transforms": Case(transforms, "transforms"),
     "colmap, binary": Case(colmap_binary, "colmap"),
     "colmap, fisheye": Case(colmap_binary, "colmap", fisheye=True),

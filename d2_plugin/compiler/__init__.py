@@ -58,6 +58,8 @@ class NoCompiler(D2Error):
 class CompileError(D2Error):
     """The compiler refused a source of this package; the message carries the compiler's own words."""
 
+    longest = 2 * MESSAGE_LIMIT
+
 
 def find_compiler() -> list[str]:
     """The command of the C++ compiler: ``CXX`` alone where it is set, else the first of c++, g++, clang++.

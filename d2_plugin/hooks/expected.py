@@ -15,7 +15,7 @@ from torch import Tensor
 from d2_plugin.errors import D2Error
 from d2_plugin.protocol import Backbone, DepthPrior, Label, Splats, View, call_optional
 from d2_plugin.reading import said
-from d2_plugin.values import shown
+from d2_plugin.values import fitting, shown
 
 _log = logging.getLogger(__name__)
 
@@ -68,13 +68,15 @@ def converted(backbone: Backbone, camera: object) -> View:
 
 def check_view(view: View) -> None:
     """Refuse a view that no image can have; waits for its device, so once per view is enough."""
+    for kind, value, what in ((str, view.camera, "camera"), (int, view.frame, "frame"), (float, view.time, "time")):
+        fitting(kind, value, f"the {what} of a view")
     name = f"the view of camera {shown(view.camera)} at frame {shown(view.frame)}"
     K, T = view.K, view.T_camera_world
     for matrix, shape, what in ((K, (3, 3), "K"), (T, (4, 4), "T_camera_world")):
         if not isinstance(matrix, Tensor) or tuple(matrix.shape) != shape:
             got = tuple(matrix.shape) if isinstance(matrix, Tensor) else type(matrix).__name__
             raise D2Error(f"{what} of {name} is {got}, expected a tensor {shape}: mend the adapter's view()")
-        if not bool(torch.isfinite(matrix).all()):
+        if matrix.is_meta or not bool(torch.isfinite(matrix).all()):
             raise D2Error(f"{what} of {name} has a number that is not finite: correct the camera")
     fx, fy = float(K[0, 0]), float(K[1, 1])
     if not (fx > 0 and fy > 0):
@@ -83,10 +85,10 @@ def check_view(view: View) -> None:
         raise D2Error(f"{name} has {view.width}x{view.height} pixels, expected at least one: correct the camera")
     rotation, last = T[:3, :3].detach().double().cpu(), [*K[2].tolist(), *T[3].tolist()]
     skewed = float((rotation @ rotation.T - torch.eye(3, dtype=torch.float64, device="cpu")).abs().max())
-    if skewed > SKEWED or float(torch.linalg.det(rotation)) < 0 or last != [0, 0, 1, 0, 0, 0, 1]:
+    if skewed > SKEWED or float(torch.linalg.det(rotation)) < 0 or last != [0, 0, 1, 0, 0, 0, 1] or K[1, 0] != 0:
         raise D2Error(
-            f"T_camera_world of {name} is no rotation and shift, or the last row of it or K is not 0 ... 0 1: correct "
-            "the camera"
+            f"T_camera_world of {name} is no rotation and shift, or K has a number below its diagonal, or the last row "
+            "of one of them is not 0 ... 0 1: correct the camera"
         )
 
 
@@ -115,37 +117,42 @@ def check_device(splats: Splats, view: View) -> None:
 
 
 def check_prior(prior: object, name: str) -> str:
-    """Refuse what a store gave and is no prior; returns what is wrong with its pixels, in a sentence that begins with
-    `name`, or nothing."""
+    """Refuse what a store gave and is no prior, with unknown labels or without a depth at most of the pixels that claim
+    one; returns what is wrong with the others, in a sentence that begins with `name`, or nothing."""
     if not isinstance(prior, DepthPrior):
         raise D2Error(
             f"{name} is a {type(prior).__name__}, expected d2_plugin.protocol.DepthPrior or None: mend prior() of the "
             "store"
         )
-    depth, labels, *others = prior
-    if not (isinstance(depth, Tensor) and isinstance(labels, Tensor) and depth.ndim == 2 and depth.is_floating_point()):
+    depth, labels, colors, sigma, reliability = prior
+    plain = [m is None or (isinstance(m, Tensor) and m.layout == torch.strided and not m.is_meta) for m in prior]
+    if not all(plain) or depth is None or labels is None or depth.ndim != 2 or not depth.is_floating_point():
         raise D2Error(f"{name} has no depth as a map [H, W] of floating-point numbers: give tensors")
-    if any(part is not None and part.shape[:2] != depth.shape for part in (labels, *others)):
+    if any(part is not None and part.shape != depth.shape for part in (labels, sigma, reliability)):
         raise D2Error(f"{name} has maps of several sizes: give all of them {tuple(depth.shape)} as its depth")
-    fits = (depth > 0) & (depth < torch.inf) | (labels == Label.EMPTY) | (labels == Label.CONFLICT)
-    unknown = labels.byte() > max(Label)
-    if bool(fits.all()) and not bool(unknown.any()):
-        return ""
-    return (
-        f"{name} has {int(unknown.sum())} labels that are none of 0 to {int(max(Label))}, and {int((~fits).sum())} "
-        "pixels whose label says that a depth is known and whose depth is NaN, infinite or not above 0: none is used"
-    )
+    if colors is not None and (colors.shape != (*depth.shape, 3) or colors.dtype != torch.uint8):
+        raise D2Error(f"{name} has colors {tuple(colors.shape)} of {colors.dtype}: give uint8 [H, W, 3]")
+    if reliability is not None and not bool(((reliability >= 0) & (reliability <= 1)).all()):
+        raise D2Error(f"{name} has a reliability outside of 0..1: mend prior() of the store")
+    known = (labels != Label.EMPTY) & (labels != Label.CONFLICT)
+    wrong = known & ~((depth > 0) & (depth < torch.inf) & (sigma is None or sigma >= 0))
+    claimed, flawed, unknown = (int(mask.sum()) for mask in (known, wrong, labels.byte() > max(Label)))
+    says = f"of {claimed} pixels labelled with a known depth {flawed} have NaN, infinity, 0 or less, or no such sigma"
+    if unknown or 2 * flawed > claimed:
+        last = int(max(Label))
+        raise D2Error(
+            f"{name} has {unknown} labels that are none of 0 to {last}, and {says}: mend prior() of the store"
+        )
+    return f"{name}: {says}; these count as empty" if flawed else ""
 
 
 def check_inserted(added: object, asked: int, grown: int) -> None:
-    """Refuse what `insert` returned where the number of Gaussians did not grow by it; warn where that is none."""
+    """Refuse what `insert` returned where the number of Gaussians did not grow by it."""
     if isinstance(added, bool) or not isinstance(added, int) or added != grown or not 0 <= added <= asked:
         raise D2Error(
             f"insert() was given {asked} points and returned {shown(added)}, and the backbone has {grown} Gaussians "
             "more: return how many were added"
         )
-    if asked and not added:
-        _log.warning("insert() of the backbone added none of %d points: densify had no effect in this step", asked)
 
 
 def small_image(backbone: Backbone, camera: object) -> Tensor | None:

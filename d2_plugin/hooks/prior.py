@@ -176,6 +176,8 @@ class Kept(NamedTuple):
         """What of a prior may be used; in memory that a GPU copies from without a wait, where `pin` is set."""
         maps, coded = believed(read.codes, belief), read.range is not None
         empty = torch.zeros_like(maps.far) if coded else ~(torch.isfinite(maps.depth) & (maps.depth > 0))
+        if maps.sigma is not None and not coded:
+            empty |= ~(maps.sigma >= 0)
         if bool(maps.far.any()):
             empty |= _outline(maps.far)
         maps = maps._replace(labels=maps.labels.masked_fill(empty, int(Label.EMPTY)))
@@ -218,6 +220,8 @@ class PriorLoader:
         self, store: Store, memory_mb: int = 2048, rename: Rename | None = None, believe: Belief = "all"
     ) -> None:
         """`memory_mb`: what the priors that are kept may take; the one in use is kept whatever it takes."""
+        if not hasattr(store, "prior"):
+            raise D2Error(f"the store is a {type(store).__name__} without prior(camera, frame): give one that has it")
         self.store, self.keep_bytes, self._rename, self.believe = store, memory_mb << 20, rename, believe
         # By camera and frame; frame + 0.5 is halfway to the next.
         self._kept: OrderedDict[tuple[str, float], Kept | None] = OrderedDict()

@@ -8,7 +8,6 @@ mono/mono.json says otherwise with {"kind": "metric" | "relative", "emulated": b
 from __future__ import annotations
 
 import logging
-import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +17,7 @@ import numpy as np
 
 from d2_plugin.arrays import read_array
 from d2_plugin.errors import D2Error
-from d2_plugin.reading import read_bytes, read_json
+from d2_plugin.reading import read_json
 from d2_plugin.recordings.cameras.camera import CalibratedCamera
 from d2_plugin.recordings.cameras.undistort import UndistortedSource, refuse_black
 from d2_plugin.recordings.files import FrameFiles, numbered_files
@@ -140,38 +139,13 @@ def _mono_description(path: Path) -> tuple[MonoKind, bool, tuple[str, ...]]:
     """(kind, emulated, notes) of the maps in mono/."""
     declared = path / "mono" / "mono.json"
     content = read_json(declared, CORRECT) if declared.exists() else {}
-    kind = content.get("kind", "relative")
-    if "emulated" not in content:
-        emulated, notes = _emulated_by_text(path)
-    else:
-        emulated, notes = content["emulated"], ("monocular maps are emulated, not predicted",)
+    kind, emulated = content.get("kind", "relative"), content.get("emulated", False)
     if not isinstance(kind, str) or kind not in get_args(MonoKind) or not isinstance(emulated, bool):
         raise D2Error(
             f"{declared} says kind {shown(kind)} and emulated {shown(emulated)}: "
             "expected 'relative' or 'metric', and true or false"
         )
-    return cast(MonoKind, kind), emulated, notes if emulated else ()
-
-
-_EMULATED = re.compile(r"(?<!\bnot )\bemulated\b", re.IGNORECASE)
-
-
-def _emulated_by_text(path: Path) -> tuple[bool, tuple[str, ...]]:
-    """Whether SOURCE.txt, or `mono` in cameras.json, says in words that the maps are emulated; and the note.
-
-    Such maps must not pass for predictions because mono.json is missing.
-    """
-    source = path / "SOURCE.txt"
-    text = read_bytes(source, REPLACE).decode(errors="replace") if source.is_file() else ""
-    lines = re.findall(r"\bmono\b(.*)", text, re.IGNORECASE)
-    try:
-        described = [str(read_json(path / "cameras.json").get("mono"))]
-    except D2Error:  # none, or a file of that name from another program
-        described = []
-    for file, words in (("SOURCE.txt", lines), ("cameras.json", described)):
-        if any(_EMULATED.search(word) for word in words):
-            return True, (f"monocular maps are emulated, not predicted ({file} says so)",)
-    return False, ()
+    return cast(MonoKind, kind), emulated, ("monocular maps are emulated, not predicted",) if emulated else ()
 
 
 def _map(path: Path, key: str | None) -> np.ndarray:

@@ -42,19 +42,6 @@ RIGS = {
         held_out=("cam00",),
         source="four views as 4C4D's default; two and three are this project's choice among them",
     ),
-    "technicolor": Rig(
-        order=("00", "15", "03", "12"),  # corners of the 4 x 4 rig: a diagonal, then the other one
-        spare=("01", "14", "02", "13"),
-        held_out=("10",),
-        source="the corners of the rig, this project's choice",
-    ),
-    "enerf": Rig(
-        # Along the arc stand 07 06 05 02 15 13 17 08 16 14 12 11 10 01 09 00 03 04: near the middle, then the sides.
-        order=("08", "12", "02", "09"),
-        spare=("17", "11", "15", "01"),
-        held_out=("00",),
-        source="spread along the arc of cameras, this project's choice",
-    ),
 }
 """By layout, as each data set numbers its cameras."""
 

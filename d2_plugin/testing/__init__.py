@@ -35,6 +35,8 @@ NEEDS = {"moments": "optimizers", "grow": "grow", "rendered depth": "render"}
 class ContractError(D2Error):
     """What a backbone's adapter gets wrong; `violations` holds one sentence for each."""
 
+    longest = 10_000  # it lists what is wrong
+
     def __init__(self, violations: Sequence[str]) -> None:
         self.violations = tuple(violations)
         super().__init__("\n".join(violations))

@@ -12,6 +12,7 @@ from d2_plugin.backbones.deform import Deform, create
 from d2_plugin.backbones.deform_fields import (
     Box,
 )
+from d2_plugin.backbones.model import decayed_rate
 from d2_plugin.recordings.export.folder import save_recording
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.runs.run import Run
@@ -116,3 +117,7 @@ def test_d2_train_runs_and_scores_it(tmp_path: Path) -> None:
     assert metrics["backbone"] == "deform"
     assert metrics["iterations"] == 24
     assert metrics["test"]["psnr"] > 8
+
+
+def test_a_field_that_does_not_learn_has_the_rate_nothing() -> None:
+    assert decayed_rate(0.0, 0.0, 5, 10) == 0.0

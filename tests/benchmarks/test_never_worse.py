@@ -20,7 +20,7 @@ pytest.importorskip("cv2")
 
 @pytest.fixture(scope="module")
 def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    recording = synthetic_recording(2, held_out=1, frames=2, width=64, height=36)
+    recording = synthetic_recording(2, held_out=1, frames=2, width=96, height=54, arc_degrees=15)
     return save_recording(recording, tmp_path_factory.mktemp("recordings") / "room")
 
 

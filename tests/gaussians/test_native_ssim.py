@@ -55,8 +55,10 @@ def test_value_and_gradient_are_those_of_torch_in_float64(
     exact, slope = loss_with_gradient(image, target, torch.float64, reference_photometric_loss, ssim_weight=weight)
     assert loss.dtype == torch.float32
     assert loss.shape == ()
-    torch.testing.assert_close(loss.double(), exact, rtol=3e-6, atol=5e-7)
-    assert (gradient - slope).norm() < 5e-6 * slope.norm()
+    # Where var = E[x^2] - mean^2 cancels, float32 leaves 6e-8 of it, 3e-5 of one pixel's SSIM (its C2 is 9e-4).
+    of_a_pixel = 3e-5 / (shape[0] * shape[1])
+    torch.testing.assert_close(loss.double(), exact, rtol=3e-6, atol=5e-7 + weight / 2 * of_a_pixel)
+    assert (gradient - slope).norm() < (5e-6 + of_a_pixel) * slope.norm()
 
 
 @pytest.mark.parametrize("level", [0.1, 0.9])

@@ -12,7 +12,7 @@ from rigs import NOISE, arc, moved, seen_by, worst
 from d2_plugin.errors import D2Error
 from d2_plugin.recordings.cameras.calibrating.bundle import project
 from d2_plugin.recordings.cameras.calibrating.features import find_features
-from d2_plugin.recordings.cameras.calibrating.refine import RefinedPoses, refine_poses, turns_in_words
+from d2_plugin.recordings.cameras.calibrating.refine import refine_poses, turns_in_words
 from d2_plugin.recordings.cameras.calibrating.rig import aligned
 from d2_plugin.recordings.cameras.calibrating.solve import solve_features
 from d2_plugin.recordings.cameras.camera import rig_width, rigid
@@ -72,19 +72,6 @@ class TestRefinedPoses:
         refined = refine_poses(truth, features)
         assert not refined.accepted
         assert "the poses stay: camera c3 shares too few features" in refined.reason
-
-    def test_a_recording_gets_accepted_poses_and_a_note(self) -> None:
-        from d2_plugin.recordings.synthetic.room import synthetic_recording
-
-        recording = synthetic_recording(cameras=2, held_out=1, frames=1, width=48, height=32)
-        name = next(iter(recording.cameras))
-        new = replace(recording.cameras[name], T_camera_world=np.eye(4))
-        poses = RefinedPoses({name: new}, True, "because", 2.0, 1.0, {}, {}, 9)
-        applied = poses.applied(recording)
-        assert applied.cameras[name] is new
-        assert len(applied.cameras) == len(recording.cameras)
-        assert applied.notes[-1] == "because"
-        assert replace(poses, accepted=False).applied(recording) is recording
 
 
 class TestRigsFromImagesAlone:

@@ -16,11 +16,7 @@ from d2_plugin.recordings.export.folder import save_recording
 from d2_plugin.recordings.presets import PROTOCOLS, RIGS, VIEWS, camera_split, resolve_cameras, split_name
 
 N3DV = tuple(f"cam{i:02d}" for i in range(21))
-NAMES = {
-    "n3dv": N3DV,
-    "technicolor": tuple(f"{i:02d}" for i in range(16)),
-    "enerf": tuple(f"{i:02d}" for i in range(18)),
-}
+NAMES = {"n3dv": N3DV}
 
 
 def rig(name: str = "sear_steak", cameras: tuple[str, ...] = N3DV, layout: str = "n3dv") -> Recording:
@@ -44,7 +40,7 @@ def test_more_views_are_fewer_views_and_one_camera_more(layout: str) -> None:
     assert set(one.held_out) <= set(split.test)
 
 
-@pytest.mark.parametrize(("layout", "title"), [("n3dv", "N3DV"), ("technicolor", "Technicolor"), ("enerf", "ENeRF")])
+@pytest.mark.parametrize(("layout", "title"), [("n3dv", "N3DV")])
 def test_the_documentation_has_the_same_lists(layout: str, title: str) -> None:
     page = (Path(__file__).parents[2] / "docs" / "recordings.md").read_text()
     [line] = [line for line in page.splitlines() if line.startswith(f"| {title}")]
@@ -102,7 +98,7 @@ def test_a_protocol_says_its_source_and_never_trains_on_what_it_scores(name: str
     assert PROTOCOLS[name] in split.notes[0]
 
 
-SIXTEEN = rig("scene", NAMES["technicolor"], "folder")
+SIXTEEN = rig("scene", tuple(f"{i:02d}" for i in range(16)), "folder")
 NO_PRESET = "is no camera preset: expected preset:2"
 
 
@@ -127,7 +123,7 @@ def test_what_fits_no_list_is_refused(recording: Recording, text: str, message: 
 
 
 def test_a_data_set_can_be_named() -> None:
-    assert camera_split(SIXTEEN, "preset:technicolor:2").train == ("00", "15")
+    assert camera_split(rig("scene", layout="folder"), "preset:n3dv:2").train == ("cam01", "cam13")
 
 
 def test_the_name_of_a_split_is_known_and_camera_names_have_none() -> None:

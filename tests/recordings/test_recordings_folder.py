@@ -90,29 +90,6 @@ def test_metric_maps_are_declared_in_mono_json(folder: Path) -> None:
     refused(folder, r"mono\.json says kind 'disparity'.*expected 'relative' or 'metric'")
 
 
-@pytest.mark.parametrize("declared", [None, {"kind": "relative"}])
-@pytest.mark.parametrize("said", ["inverse depth, affine-invariant (emulated, see SOURCE.txt)", "Emulated"])
-def test_maps_that_cameras_json_calls_emulated_are_emulated(folder: Path, said: str, declared: dict | None) -> None:
-    (folder / "mono" / "mono.json").unlink()
-    if declared:
-        (folder / "mono" / "mono.json").write_text(json.dumps(declared))
-    edit_calibration(folder, None, mono=said)
-    recording = open_recording(folder)
-    assert recording.mono_emulated
-    assert "monocular maps are emulated, not predicted (cameras.json says so)" in recording.notes
-
-
-def test_what_source_txt_and_cameras_json_say_in_words_is_understood(folder: Path) -> None:
-    (folder / "mono" / "mono.json").unlink()
-    edit_calibration(folder, None, mono="predicted by a network, not emulated")
-    assert not open_recording(folder).mono_emulated
-    (folder / "SOURCE.txt").write_text("images/: rendered\nmono/<camera>: EMULATED, see the paper\n")
-    assert open_recording(folder).mono_emulated
-    (folder / "mono" / "mono.json").write_text('{"emulated": false}')  # a declaration is worth more than words
-    assert not open_recording(folder).mono_emulated
-    assert not any("emulated" in note for note in open_recording(folder).notes)
-
-
 def test_depth_that_is_not_finite_counts_as_unknown(folder: Path, original: Recording) -> None:
     depth = original.depth("train0", 0).copy()
     depth[0, :3] = np.nan, np.inf, -1

@@ -24,6 +24,7 @@ from tiny import (
 from d2_plugin import D2Config, D2Hooks
 from d2_plugin.backbones.model import SplatModel
 from d2_plugin.config import DensifyConfig, DepthLossConfig, PruneConfig
+from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.photometric import photometric_loss
 from d2_plugin.hooks.depth_loss import charbonnier
 from d2_plugin.protocol import DepthPrior, Label
@@ -223,14 +224,11 @@ def test_case_34_without_trusted_pixels_nothing_is_pruned_whatever_the_threshold
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, 0.0, -1.0])
-def test_case_35_depths_that_are_none_support_nothing(model: SplatModel, bad: float) -> None:
+def test_case_35_a_map_without_any_depth_is_refused(model: SplatModel, bad: float) -> None:
     store = Store(lambda depth, labels: (torch.full_like(depth, bad), torch.full_like(labels, int(Label.VERIFIED))))
     d2 = D2Hooks(replace(ALL_HOOKS, prior=None), make_adapter(model), store)
-    for view in make_views():
-        model.render(view)
-        assert d2.loss(1, view) == 0.0
-    report = d2.step(20)
-    assert (report.inserted, report.removed, report.gaussians) == (0, 0, 60)
+    with pytest.raises(D2Error, match="of 768 pixels labelled with a known depth 768 have NaN"):
+        d2.loss(1, make_views()[0])
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, 0.0])

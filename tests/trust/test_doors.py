@@ -19,12 +19,13 @@ from small_layouts import write_layout
 from d2_plugin.cache import Untrusted, cache_folder, check_private
 from d2_plugin.commands import cli
 from d2_plugin.commands.cli import main
-from d2_plugin.durable import refuse_foreign
 from d2_plugin.errors import D2Error
 from d2_plugin.reading import Unreadable, parse_json, parse_toml
+from d2_plugin.recordings.cameras.calibration import read_calibration
 from d2_plugin.recordings.cameras.formats.document import Document
 from d2_plugin.recordings.importing.settings import by_camera, finite
 from d2_plugin.recordings.importing.video import videos_below
+from d2_plugin.store.store import PriorStore
 
 pytest.importorskip("cv2", reason="opencv is in the `image` extra")
 
@@ -50,11 +51,16 @@ def test_a_prior_that_was_mistyped_is_not_built(recording: Path, tmp_path: Path,
 def test_nothing_is_written_inside_the_images_of_a_recording(recording: Path, tmp_path: Path, refused: Refused) -> None:
     (tmp_path / "room").symlink_to(recording)
     for place in (recording / "images" / "zz", tmp_path / "room" / "images" / "zz" / "deeper"):
-        for command in ("train", "priors"):
-            words = [command, recording, "--train-cameras", "cam00,cam01", "--output", place]
-            assert "where every folder is a camera" in refused(*words)
+        of_two, run = ["--train-cameras", "cam00,cam01"], tmp_path / "run"
+        for words in (
+            ["train", recording, *of_two], ["priors", recording, *of_two], ["ablate", recording, *of_two], ["demo"],
+            ["report", run], ["export", run], ["export", run, "--format", "ply"], ["render", run],
+            ["export-recording", recording, "--format", "n3dv"], ["import", run, "--calibration", "x"],
+            ["bench", "training", f"{recording}@cam00+cam01"],
+        ):  # fmt: skip
+            assert "where every folder is a camera" in refused(*words, "--output", place)
         with pytest.raises(D2Error, match="where every folder is a camera"):
-            refuse_foreign(place / "report.md", "sign", "d2 report")
+            PriorStore.create(place, ["a"], [0], {})
     assert not (recording / "images" / "zz").exists()
 
 
@@ -102,6 +108,17 @@ def test_yaml_that_no_calibration_needs_is_refused(tmp_path: Path, text: str) ->
     (tmp_path / "rig.yml").write_text(text)
     with pytest.raises(D2Error):
         _ = Document(tmp_path / "rig.yml").content
+
+
+def test_a_sentence_that_repeats_a_damaged_file_is_short(tmp_path: Path) -> None:
+    camera = (
+        f"camera_model: pinhole\n  distortion_model: {'x' * 9000}\n  intrinsics: [9, 9, 9, 9]\n  resolution: [9, 9]"
+    )
+    (tmp_path / "camchain.yaml").write_text(f"cam0:\n  {camera}\n")
+    with pytest.raises(D2Error) as refusal:
+        read_calibration(tmp_path / "camchain.yaml")
+    assert len(str(refusal.value)) < 1300
+    assert str(refusal.value).endswith("calibrate it with Kalibr's pinhole-equi or pinhole-radtan")
 
 
 def test_a_name_that_stands_twice_is_named() -> None:

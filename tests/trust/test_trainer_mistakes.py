@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import os
 import signal
 import subprocess
@@ -56,8 +57,17 @@ def verified(prior: DepthPrior, depth: float) -> DepthPrior:
         (lambda prior: tuple(prior), "is a tuple, expected"),
         (lambda prior: prior._replace(labels=prior.labels[1:]), "has maps of several sizes"),
         (lambda prior: prior._replace(sigma=prior.depth[1:]), "has maps of several sizes"),
+        (lambda prior: prior._replace(sigma="x"), "give tensors"),
+        (lambda prior: prior._replace(depth=prior.depth.to("meta")), "give tensors"),
+        (lambda prior: prior._replace(depth=prior.depth.to_sparse()), "give tensors"),
+        (lambda prior: prior._replace(colors=torch.rand(24, 32, 3)), "give uint8"),
+        (lambda prior: prior._replace(reliability=-prior.depth), "reliability outside of 0..1"),
         (lambda prior: prior._replace(depth=prior.depth.numpy()), "has no depth as a map"),
         (lambda prior: prior._replace(depth=prior.depth.long()), "has no depth as a map"),
+        (lambda prior: prior._replace(labels=torch.full_like(prior.labels, 9)), "has 768 labels that are none"),
+        *((lambda prior, depth=depth: prior._replace(depth=torch.full_like(prior.depth, depth)), "of 744 pixels .* 744")
+          for depth in (float("nan"), float("inf"), -3.0, 0.0)),
+        (lambda prior: prior._replace(sigma=-torch.ones_like(prior.depth)), "of 744 pixels .* 744"),
     ],
 )  # fmt: skip
 def test_a_prior_that_cannot_be_is_refused(change: Callable[[DepthPrior], object], says: str) -> None:
@@ -65,24 +75,17 @@ def test_a_prior_that_cannot_be_is_refused(change: Callable[[DepthPrior], object
         hooks(ChangedStore(change)).loss(1, VIEWS[0])
 
 
-@pytest.mark.parametrize(
-    ("change", "says"),
-    [
-        *((lambda prior, depth=depth: verified(prior, depth), "1 pixels whose label says that a depth is known")
-          for depth in (float("nan"), float("inf"), -3.0, 0.0)),
-        (lambda prior: prior._replace(labels=torch.full_like(prior.labels, 9)), "768 labels that are none of 0 to 5"),
-    ],
-)  # fmt: skip
-def test_pixels_of_a_prior_that_cannot_be_are_counted_once_per_camera(
-    change: Callable[[DepthPrior], object], says: str, caplog: pytest.LogCaptureFixture
+@pytest.mark.parametrize("depth", [float("nan"), float("inf"), -3.0, 0.0])
+def test_some_pixels_of_a_prior_that_cannot_be_are_counted_once_per_camera(
+    depth: float, caplog: pytest.LogCaptureFixture
 ) -> None:
-    d2 = hooks(ChangedStore(change))
+    d2 = hooks(ChangedStore(lambda prior: verified(prior, depth)))
     for step in (1, 2):
         d2.loss(step, [view for view in VIEWS if view.camera == "cam0"])
-    assert caplog.text.count(says) == 1
+    assert caplog.text.count("of 744 pixels labelled with a known depth 1 have NaN") == 1
 
 
-@pytest.mark.parametrize("name", ["zeros", "mirrored", "scaled", "no last row", "K of zeros"])
+@pytest.mark.parametrize("name", ["zeros", "mirrored", "scaled", "no last row", "K of zeros", "K transposed"])
 def test_a_pose_that_cannot_be_is_refused(name: str) -> None:
     view, pose, K = VIEWS[0], torch.eye(4), VIEWS[0].K.clone()
     if name == "zeros":
@@ -93,10 +96,18 @@ def test_a_pose_that_cannot_be_is_refused(name: str) -> None:
         pose[:3, :3] *= 1.1
     elif name == "no last row":
         pose[3] = 0
-    else:
+    elif name == "K of zeros":
         K[2, 2] = 0
-    with pytest.raises(D2Error, match="is no rotation and shift, or the last row of it or K"):
+    else:
+        K[1, 0] = 5
+    with pytest.raises(D2Error, match="is no rotation and shift, or K has"):
         hooks().loss(1, replace(view, T_camera_world=pose, K=K))
+
+
+@pytest.mark.parametrize(("name", "value"), [("time", "x"), ("time", math.nan), ("frame", 0.5), ("camera", None)])
+def test_what_a_view_is_called_is_looked_at(name: str, value: object) -> None:
+    with pytest.raises(D2Error, match=f"the {name} of a view must be"):
+        hooks().loss(1, replace(VIEWS[0], **{name: value}))
 
 
 def test_a_step_that_falls_repeats_or_differs_is_named_once(caplog: pytest.LogCaptureFixture) -> None:
@@ -119,6 +130,11 @@ def test_a_step_that_falls_repeats_or_differs_is_named_once(caplog: pytest.LogCa
         assert caplog.text.count("which rises from one to the next") == 1
 
 
+def test_a_store_without_priors_is_refused() -> None:
+    with pytest.raises(D2Error, match=r"the store is a object without prior\(camera, frame\)"):
+        hooks(object())
+
+
 class Lazy(Yang4DAdapter):
     """Inserts nothing, and says what it is told to."""
 
@@ -135,8 +151,9 @@ def test_an_insert_that_does_nothing_is_noticed(said: object, caplog: pytest.Log
     d2 = hooks(config=D2Config(densify=DensifyConfig(start=1, every=1)), adapter=adapter)
     d2.loss(1, VIEWS[0])
     if said == 0 and said is not True:
-        d2.step(1)
-        assert "insert() of the backbone added none of" in caplog.text
+        for step in (1, 2):
+            d2.step(step)
+        assert caplog.text.count("insert() of the backbone added none of") == 1
     else:
         with pytest.raises(D2Error, match=r"insert\(\) was given .* and returned .*return how many were added"):
             d2.step(1)
@@ -163,7 +180,11 @@ def default(dtype: torch.dtype) -> Iterator[None]:
 )
 def test_what_torch_does_to_every_tensor_is_refused_where_d2_cannot_work_with_it(around: Callable) -> None:
     d2 = hooks()
-    for call in (lambda: d2.loss(1, VIEWS[0]), lambda: d2.step(1)):
+    for call in (
+        lambda: d2.loss(1, VIEWS[0]),
+        lambda: d2.step(1),
+        lambda: D2Hooks(ALL_HOOKS, d2.backbone, TinyStore()),
+    ):
         with around(), pytest.raises(D2Error, match="D2 needs float32 as the default dtype"):
             call()
 

@@ -13,9 +13,11 @@ import inspect
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, is_dataclass
+from pathlib import Path
 from typing import Any, NamedTuple, TypeVar, get_args
 
 from d2_plugin.commands.arguments.text import bare, flag_of, item_kind, read
+from d2_plugin.durable import refuse_inside_images
 from d2_plugin.errors import D2Error
 from d2_plugin.settings import Declared, declared
 
@@ -90,6 +92,8 @@ class Form:
             for part in path:
                 table = table.setdefault(part, {})
             table[last] = _as_toml(value) if path else value
+        if isinstance(values.get("output"), Path):
+            refuse_inside_images(values["output"])
         missing = [typed_as(setting) for setting in self.settings if setting.name not in values]
         if missing:
             raise D2Error(f"{self.command} needs {' and '.join(missing)}: `{self.command} --help` says what that is")

@@ -33,6 +33,9 @@ LARGE_RIG = 100.0
 """Rigs wider than this are noted: nobody films with two to ten cameras a hundred metres apart, while a room in
 millimetres or centimetres comes out this wide."""
 
+SUFFIXES = (".toml", ".json", ".yaml", ".yml", ".xml")
+"""Of the files in a folder that may be its calibration, beside .qca.txt."""
+
 FORMATS: dict[str, Callable[[Document], list[CalibratedCamera] | None]] = {
     "folder": read_cameras_json,
     "caliscope": tools.read_caliscope,
@@ -42,6 +45,8 @@ FORMATS: dict[str, Callable[[Document], list[CalibratedCamera] | None]] = {
     "kalibr": tools.read_kalibr,
     "multical": tools.read_multical,
     "panoptic": tools.read_panoptic,
+    "qualisys": tools.read_qualisys,
+    "opencv": tools.read_opencv,
     "transforms": read_transforms,
     "colmap": read_colmap,
     "colmap_rig": read_rig_config,
@@ -106,7 +111,7 @@ def _recognised(path: Path) -> tuple[str, list[CalibratedCamera]]:
         path = path.parent  # a part of a COLMAP model
     read = _read(path)
     if read is None and path.is_dir():
-        files = [file for file in sorted(path.iterdir()) if file.suffix in (".toml", ".json", ".yaml", ".yml")]
+        files = [file for file in sorted(path.iterdir()) if file.suffix in SUFFIXES or file.name.endswith(".qca.txt")]
         several = {file.name: read for file in files if (read := _read(file)) is not None}
         if len(several) != 1:
             listed = ", ".join(several) or "none"

@@ -2,18 +2,21 @@
 
 The address ends in a token. The page's first request trades it for a cookie, without which no connection is opened, so
 another user of the machine, or a web page in the same browser, cannot look or move. A connection must also come from
-the page itself (Origin) and, where only this machine is listened to, be addressed to it by name (Host).
+the page itself (Origin) and, where only this machine is listened to, be addressed to it by name (Host). Of what comes
+over it, only what the page sends is handed on: viser knows messages that share the page on the internet.
 """
 
 from __future__ import annotations
 
+import asyncio
 import functools
 import io
+import logging
 import secrets
 import socket
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, redirect_stdout
+from contextlib import contextmanager, redirect_stdout, suppress
 from http import HTTPStatus
 from http.cookies import CookieError, SimpleCookie
 from typing import Any, NamedTuple
@@ -22,8 +25,12 @@ from urllib.parse import parse_qs, urlsplit
 from d2_plugin.errors import D2Error
 from d2_plugin.extras import imported
 
+log = logging.getLogger(__name__)
+
 LOCAL = ("127.0.0.1", "localhost", "::1")
 COOKIE = "d2-view"
+LONGEST = 1 << 16
+"""Bytes of a message; the page's have a few hundred."""
 
 
 class Page(NamedTuple):
@@ -43,8 +50,9 @@ def serve(host: str, port: int) -> Page:
     # Of a page that was closed while its image was drawn.
     warnings.filterwarnings("ignore", "Queued a .* on a closed connection")
     token = secrets.token_urlsafe(16)
-    with redirect_stdout(io.StringIO()), _guarded(Access(host, token)):  # it prints a table with addresses
-        viser = imported("viser", "viser", "view", "the live viewer")
+    viser = imported("viser", "viser", "view", "the live viewer")
+    # It prints a table with addresses.
+    with redirect_stdout(io.StringIO()), _guarded(Access(host, token), viser.infra.Message.deserialize):
         server = viser.ViserServer(host=host, port=port, label="D2-4DGS", verbose=False)
     server.gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=True, control_width="medium")
     name = "localhost" if host in ("127.0.0.1", "0.0.0.0") else f"[{host}]" if ":" in host else host
@@ -80,7 +88,7 @@ class Access(NamedTuple):
 
 
 @contextmanager
-def _guarded(access: Access) -> Iterator[None]:
+def _guarded(access: Access, understood: Callable[[bytes], Any]) -> Iterator[None]:
     """Within it, a server that viser starts asks `access` first: viser has no such place of its own."""
     import websockets.asyncio.server as module
     from websockets.datastructures import Headers
@@ -101,7 +109,21 @@ def _guarded(access: Access) -> Iterator[None]:
             response.headers["Set-Cookie"] = cookie
         return response
 
+    class Connection(module.ServerConnection):
+        async def recv(self, *arguments: Any, **options: Any) -> Any:
+            while True:
+                data = await super().recv(*arguments, **options)
+                with suppress(Exception):  # what viser cannot read may be anything
+                    if _is_the_pages(understood(data)):
+                        return data
+
+    def failed(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+        log.info("what a page sent was not taken (%s)", context.get("exception", context["message"]))
+
     def guarded(*arguments: Any, process_request: Callable[[Any, Any], Any], **options: Any) -> Any:
+        asyncio.get_running_loop().set_exception_handler(failed)
+        quiet = logging.Logger("websockets", logging.CRITICAL)  # a client that talks nonsense is not worth a traceback
+        options |= {"max_size": LONGEST, "create_connection": Connection, "logger": quiet}
         return plain(*arguments, process_request=functools.partial(answer, process_request), **options)
 
     module.serve = guarded  # type: ignore[assignment, misc]
@@ -109,6 +131,14 @@ def _guarded(access: Access) -> Iterator[None]:
         yield
     finally:
         module.serve = plain  # type: ignore[misc]
+
+
+def _is_the_pages(message: Any) -> bool:
+    """Whether a message is one that our page sends: the camera, the value of a control, a click at a frustum."""
+    kind = type(message).__name__
+    if kind == "GuiUpdateMessage":
+        return list(message.updates) == ["value"]  # others would replace what belongs to the control
+    return kind in ("ViewerCameraMessage", "SceneNodeClickMessage")
 
 
 def _check_address(host: str) -> None:

@@ -172,6 +172,8 @@ class Viewer:
         try:
             act()
         except Exception as failure:
+            if page.client.client_id not in self._clients:
+                return  # somebody closed it meanwhile
             log.warning("a page of the live viewer is not drawn any more: %r", failure, exc_info=failure)
             self._disconnected(page.client)
 

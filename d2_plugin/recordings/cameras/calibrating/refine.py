@@ -79,12 +79,6 @@ class RefinedPoses:
     points: int
     turns: dict[str, Turn] = field(default_factory=dict)
 
-    def applied(self, recording: Recording) -> Recording:
-        """The recording with these poses and a note; the same recording where they were not accepted."""
-        if not self.accepted:
-            return recording
-        return replace(recording, cameras={**recording.cameras, **self.cameras}, notes=(*recording.notes, self.reason))
-
 
 @checked_arguments
 def refine(recording: Recording, cameras: Sequence[str] | None = None, moments: int = MOMENTS) -> RefinedPoses:

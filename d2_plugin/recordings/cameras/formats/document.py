@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any
+from xml.etree import ElementTree
 
 import numpy as np
 
@@ -18,12 +19,6 @@ from d2_plugin.values import Range, shown
 CORRECT = "correct the file, see docs/calibration.md"
 
 MOST_BYTES = 1 << 26  # larger calibrations are refused: a rig of 500 cameras takes a few hundred kilobytes
-
-XML = {
-    "<opencv_storage": "XML of OpenCV, which no rig is read from: write intri.yml and extri.yml, or Pose2Sim's TOML",
-    "<calibration": "a calibration of Qualisys: convert it to TOML with Pose2Sim (`calib_qca_to_toml`)",
-}
-"""What XML begins with -> what it is, and what to do: these are named, not read."""
 
 NUMBER = Annotated[float, Range(-LARGEST_NUMBER, LARGEST_NUMBER)]
 
@@ -42,23 +37,48 @@ class Document:
         return str(self.path)
 
     @cached_property
-    def content(self) -> Any:
-        """The value of a JSON or YAML file or the tables of a TOML file; None for a folder and for OpenCV's YAML."""
+    def text(self) -> str:
+        """The text of the file; nothing for a folder."""
         if self.path.is_dir():
-            return None
+            return ""
         if read_bytes(self.path, CORRECT, MOST_BYTES)[:1] == b"\x80":
             raise D2Error(
                 f"{self.path} is a pickle, which can run any program when it is opened: convert it to TOML with "
                 "Pose2Sim's or OpenCap's own tool"
             )
-        text = read_text(self.path, CORRECT, MOST_BYTES)
-        named = next((tool for mark, tool in XML.items() if mark in text[:4096]), None)
-        if named is not None and text.lstrip().startswith("<"):
-            raise D2Error(f"{self.path} is {named}")
+        return read_text(self.path, CORRECT, MOST_BYTES)
+
+    @cached_property
+    def xml(self) -> ElementTree.Element | None:
+        """The root of an XML file; None for anything else."""
+        if not self.text.lstrip().startswith("<"):
+            return None
+        check_slow(self.text, self.place, CORRECT)
+        if "<!" in re.sub(r"<!--.*?-->", "", self.text, flags=re.DOTALL):
+            raise D2Error(f"{self.path} is XML that declares entities, which no calibration needs: {CORRECT}")
+        with parsing(self.place, CORRECT):
+            return ElementTree.fromstring(self.text)
+
+    @cached_property
+    def opencv(self) -> Table:
+        """The entries of OpenCV's FileStorage, YAML or XML, a matrix as {"data": [...]}; nothing for anything else."""
+        if self.text.startswith("%YAML"):
+            content = parse_yaml(self.text.partition("\n")[2], self.place)
+            return content if isinstance(content, dict) else {}
+        if self.xml is None or self.xml.tag != "opencv_storage":
+            return {}
+        matrices = {entry.tag: entry.findtext("data") for entry in self.xml}
+        words = {entry.tag: (entry.text or "").replace('"', " ").split() for entry in self.xml}
+        return {key: words[key] if data is None else {"data": data.split()} for key, data in matrices.items()}
+
+    @cached_property
+    def content(self) -> Any:
+        """The value of a JSON or YAML file or the tables of a TOML file; None for a folder, XML and OpenCV's YAML."""
+        text = self.text
+        if not text or self.xml is not None or text.startswith("%YAML"):
+            return None
         if re.match(r"\s*(\{|\[\s*\{)", text):
             return parse_json(text, self.place, CORRECT)
-        if text.startswith("%YAML"):
-            return None
         plain_yaml = re.search(r"^[\w.-]+:(\s|$)", text, re.MULTILINE)
         if plain_yaml and not re.search(r"^[ \t]*\[", text, re.MULTILINE):
             return parse_yaml(text, self.place)
@@ -103,6 +123,14 @@ def numbers(table: Mapping[str, Any], key: str, shape: tuple[int, ...], place: s
     if not (np.abs(array) <= LARGEST_NUMBER).all():
         raise D2Error(f"{key} of {place} has a number that is not finite or too large: {CORRECT}")
     return array.reshape(shape)
+
+
+def matrix_of(table: Mapping[str, Any], key: str, shape: tuple[int, ...], where: str) -> np.ndarray:
+    """A matrix of OpenCV's FileStorage, [*shape]: a row serves as well as a column."""
+    entry = table.get(key)
+    if not isinstance(entry, dict) or not isinstance(entry.get("data"), list):
+        raise D2Error(f"{key} in {where} is no matrix of numbers: write it as an opencv-matrix")
+    return numbers(entry, "data", shape, f"{key} in {where}")
 
 
 def coefficients(table: Mapping[str, Any], key: str, place: str) -> np.ndarray:

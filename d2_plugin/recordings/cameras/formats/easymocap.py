@@ -12,9 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from d2_plugin.errors import D2Error
-from d2_plugin.reading import read_text
 from d2_plugin.recordings.cameras.camera import OPENCV_CENTRE, CalibratedCamera, rigid
-from d2_plugin.recordings.cameras.formats.document import CORRECT, MOST_BYTES, Document, Table, numbers, parse_yaml
+from d2_plugin.recordings.cameras.formats.document import Document, Table, matrix_of, numbers
 from d2_plugin.recordings.cameras.lens import checked_lens
 from d2_plugin.recordings.cameras.rotations import rotation_of_vector
 
@@ -46,10 +45,8 @@ def read_rig(folder: Path) -> list[CalibratedCamera]:
 
 
 def _read(path: Path) -> Table:
-    text = read_text(path, CORRECT, MOST_BYTES)
-    header, _, body = text.partition("\n")
-    content = parse_yaml(body, str(path)) if header.startswith("%YAML") else None
-    if not isinstance(content, dict):
+    content = Document(path).opencv
+    if not content:
         raise D2Error(f"{path} is not a YAML file of OpenCV's, which begins with %YAML: restore the file")
     return content
 
@@ -63,15 +60,15 @@ def _names(table: Table, prefix: str) -> list[str]:
 
 def _camera(name: str, intrinsics: Table, extrinsics: Table, folder: Path) -> CalibratedCamera:
     where = f"{folder / INTRINSICS} and {EXTRINSICS}"
-    K = _matrix(intrinsics, f"K_{name}", (3, 3), where)
+    K = matrix_of(intrinsics, f"K_{name}", (3, 3), where)
     K[:2, 2] += OPENCV_CENTRE
     bent = next((key for key in (f"D_{name}", f"dist_{name}") if key in intrinsics), None)
     lens = checked_lens(
-        K, "opencv", () if bent is None else _matrix(intrinsics, bent, (-1,), where), f"camera {name} in {where}"
+        K, "opencv", () if bent is None else matrix_of(intrinsics, bent, (-1,), where), f"camera {name} in {where}"
     )
     width, height = _pair(intrinsics, f"W_{name}", f"H_{name}", where) or (0, 0)
     near_far = _pair(extrinsics, f"n_{name}", f"f_{name}", where)
-    translation = _matrix(extrinsics, f"T_{name}", (3,), where)
+    translation = matrix_of(extrinsics, f"T_{name}", (3,), where)
     pose = rigid(_rotation(name, extrinsics, where), translation)
     return CalibratedCamera(name, round(width), round(height), lens, pose, near_far)
 
@@ -79,18 +76,10 @@ def _camera(name: str, intrinsics: Table, extrinsics: Table, folder: Path) -> Ca
 def _rotation(name: str, extrinsics: Table, where: str) -> np.ndarray:
     """The rotation vector is preferred, as the layout's own readers do."""
     if f"R_{name}" in extrinsics:
-        return rotation_of_vector(_matrix(extrinsics, f"R_{name}", (3,), where))
+        return rotation_of_vector(matrix_of(extrinsics, f"R_{name}", (3,), where))
     if f"Rot_{name}" not in extrinsics:
         raise D2Error(f"{where} have neither R_{name} nor Rot_{name}: add the rotation of camera {name}")
-    return _matrix(extrinsics, f"Rot_{name}", (3, 3), where)
-
-
-def _matrix(table: Table, key: str, shape: tuple[int, ...], where: str) -> np.ndarray:
-    """An !!opencv-matrix: a row serves as well as a column."""
-    entry = table[key]
-    if not isinstance(entry, dict) or not isinstance(entry.get("data"), list):
-        raise D2Error(f"{key} in {where} is no matrix of numbers: write it as !!opencv-matrix")
-    return numbers(entry, "data", shape, f"{key} in {where}")
+    return matrix_of(extrinsics, f"Rot_{name}", (3, 3), where)
 
 
 def _pair(table: Table, one: str, other: str, where: str) -> tuple[float, float] | None:

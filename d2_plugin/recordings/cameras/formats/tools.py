@@ -1,11 +1,13 @@
-"""Calibrations of Pose2Sim, Caliscope, Anipose, Kalibr, Multical and CMU Panoptic.
+"""Calibrations of Pose2Sim, Caliscope, Anipose, Kalibr, Multical, CMU Panoptic, Qualisys and OpenCV's own programs.
 
-All of them give a K for pixels whose first centre lies at 0, OpenCV's coefficients and a pose from world to camera.
+All of them give a K for pixels whose first centre lies at 0 (of Qualisys, Pose2Sim takes it so) and OpenCV's
+coefficients; all but Qualisys a pose from world to camera.
 """
 
 from __future__ import annotations
 
 from typing import Any, Optional
+from xml.etree.ElementTree import Element
 
 import numpy as np
 
@@ -18,6 +20,7 @@ from d2_plugin.recordings.cameras.formats.document import (
     Table,
     coefficients,
     has,
+    matrix_of,
     numbers,
     object_of,
     size_of,
@@ -28,6 +31,8 @@ from d2_plugin.recordings.cameras.rotations import rotation_of_vector
 Cameras = Optional[list[CalibratedCamera]]  # noqa: UP045  at run time, on Python 3.9 too
 
 CENTIMETRES = 0.01  # of the positions in CMU Panoptic's files, in metres
+
+SUBPIXELS, MILLIMETRES = 64, 0.001  # of lengths and of positions in Qualisys' files
 
 KALIBR_DISTORTIONS = {"radtan": ("opencv", 4), "equidistant": ("fisheye", 4), "none": ("pinhole", 0)}
 """Kalibr's name -> model and number of coefficients."""
@@ -193,4 +198,65 @@ def read_panoptic(document: Document) -> Cameras:
         K, distortion = numbers(table, "K", (3, 3), place), numbers(table, "distCoef", (-1,), place)
         R, t = numbers(table, "R", (3, 3), place), CENTIMETRES * numbers(table, "t", (3,), place)
         cameras.append(_camera(name, place, size_of(table, "resolution", place), K, "opencv", distortion, R, t))
+    return cameras
+
+
+def read_qualisys(document: Document) -> Cameras:
+    """QTM's .qca.txt: XML with lengths in 64ths of a pixel of the sensor and positions in millimetres.
+
+    Rows of the rotation are the camera's axes, x right, y up, z backward. Coefficients are those of OpenCV, not scaled.
+    """
+    if document.xml is None or document.xml.tag != "calibration":
+        return None
+    cameras = []
+    for entry in document.xml.findall("cameras/camera"):
+        name = entry.get("serial", "without serial")
+        place = f"camera {name} in {document.place}"
+        if entry.get("active") == "0":
+            continue
+
+        def given(part: str, *keys: str, entry: Element = entry, place: str = place) -> np.ndarray:
+            found = entry.find(part)
+            values = {} if found is None else found.attrib
+            missing = [key for key in keys if key not in values]
+            if missing:
+                raise D2Error(f"{place} has no {missing[0]} of its {part}: {CORRECT}")
+            return numbers({part: [values[key] for key in keys]}, part, (len(keys),), place)
+
+        left, top, right, bottom = given("fov_video", "left", "top", "right", "bottom")
+        size = size_of({"fov_video": [right - left + 1, bottom - top + 1]}, "fov_video", place)
+        fx, fy, cx, cy = given("intrinsic", "focalLengthU", "focalLengthV", "centerPointU", "centerPointV") / SUBPIXELS
+        radial = given("intrinsic", *(f"radialDistortion{n}" for n in (1, 2, 3)))
+        tangential = given("intrinsic", "tangentalDistortion1", "tangentalDistortion2")
+        R = given("transform", *(f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3))).reshape(3, 3) * [[1], [-1], [-1]]
+        t = -R @ (MILLIMETRES * given("transform", "x", "y", "z"))
+        lens = np.array([*radial[:2], *tangential, radial[2]])
+        cameras.append(_camera(name, place, size, pinhole(fx, fy, cx - left, cy - top), "opencv", lens, R, t))
+    return cameras
+
+
+def read_opencv(document: Document) -> Cameras:
+    """XML and YAML of OpenCV's programs: `stereo_calib` (M1 D1 M2 D2 of intrinsics, R T of extrinsics, from the first
+    camera to the second; in two files or one) and the multi-camera calibration of ccalib. Neither names sizes."""
+    path, table, place = document.path, document.opencv, document.place
+    beside = {"intrinsics": "extrinsics", "extrinsics": "intrinsics"}.get(path.stem)
+    if beside and path.with_stem(beside).is_file():
+        table = table | Document(path.with_stem(beside)).opencv
+    poses = {"1": np.eye(4)}
+    if {"M1", "M2", "R", "T"} <= table.keys():
+        poses["2"] = rigid(matrix_of(table, "R", (3, 3), place), matrix_of(table, "T", (3,), place))
+        names = "M{}", "D{}"
+    elif "camera_matrix_0" in table and not any(key.startswith("xi_") for key in table):
+        numbered = (key.removeprefix("camera_matrix_") for key in table if key.startswith("camera_matrix_"))
+        poses = {number: matrix_of(table, f"camera_pose_{number}", (4, 4), place) for number in numbered}
+        names = "camera_matrix_{}", "camera_distortion_{}"
+    else:
+        return None
+    cameras = []
+    for number, pose in poses.items():
+        K, distortion = (
+            matrix_of(table, key.format(number), shape, place) for key, shape in zip(names, ((3, 3), (-1,)))
+        )
+        lens = (K, "opencv", distortion.ravel(), pose[:3, :3], pose[:3, 3])
+        cameras.append(_camera(f"cam{number}", f"camera {number} in {place}", (0, 0), *lens))
     return cameras

@@ -1,0 +1,139 @@
+"""The live viewer's socket, attacked: whatever a client sends, nothing is printed, others are served, nothing stops."""
+
+from __future__ import annotations
+
+import random
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from socket import create_connection
+from typing import Any
+
+import pytest
+from fuzzing import SEED, mutated_bytes, mutated_value
+
+from d2_plugin.viewing.live import Viewer
+from d2_plugin.viewing.live.server import COOKIE
+from d2_plugin.viewing.viewed import ViewedRun
+
+viser = pytest.importorskip("viser", reason="viser is in the `view` extra")
+msgpack = pytest.importorskip("msgspec").msgpack
+ConnectionClosed = pytest.importorskip("websockets.exceptions").ConnectionClosed
+
+FEW, MANY = 200, 10_000
+CAMERA = {
+    "type": "ViewerCameraMessage",
+    "wxyz": [1.0, 0.0, 0.0, 0.0],
+    "position": [0.0, 0.0, -1.0],
+    "fov": 0.8,
+    "near": 0.01,
+    "far": 1000.0,
+    "image_height": 300,
+    "image_width": 400,
+    "look_at": [0.0, 0.0, 1.0],
+    "up_direction": [0.0, -1.0, 0.0],
+}
+
+
+@contextmanager
+def showing(viewed: ViewedRun) -> Iterator[Viewer]:
+    """A viewer whose images are drawn by a thread of its own."""
+    viewer, stop = Viewer(viewed=viewed, port=18080, height=48), threading.Event()
+    thread = threading.Thread(target=viewer.stay, args=(stop.is_set,))
+    thread.start()
+    try:
+        yield viewer
+        assert thread.is_alive(), "what draws has stopped"
+    finally:
+        stop.set()
+        thread.join()
+        viewer.close()
+
+
+def connected(viewer: Viewer) -> Any:
+    """A client's socket, behind its first camera message."""
+    from websockets.sync.client import connect
+
+    address, _, token = viewer.url.partition("/?token=")
+    headers = {"Cookie": f"{COOKIE}={token}"}
+    protocol = f"viser-v{viser.__version__}"
+    socket = connect(address.replace("http", "ws"), origin=address, additional_headers=headers,
+                     subprotocols=[protocol], compression=None, max_size=None, max_queue=None)  # fmt: skip
+    socket.send(msgpack.encode(CAMERA))
+    return socket
+
+
+def until(condition: Callable[[], bool], seconds: float = 20) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "it never happened"
+        time.sleep(0.01)
+
+
+def drawn(viewer: Viewer, count: int) -> None:
+    """Wait until that many pages have their first image."""
+    until(lambda: [page.drawn is not None for page, _ in dict(viewer._pages).values()] == [True] * count)
+
+
+def messages_of(viewer: Viewer) -> list[dict[str, Any]]:
+    """Everything that a page can send, and what viser has besides."""
+    from viser import _messages
+
+    page, _ = list(viewer._pages.values())[-1]
+    updates = [
+        {"type": "GuiUpdateMessage", "uuid": control._impl.uuid, "updates": {"value": control._impl.value}}
+        for control in page.controls.values()
+    ]
+    kinds = [kind for kind in _messages.Message.get_subclasses() if hasattr(kind, "__dataclass_fields__")]
+    known = [{"type": kind.__name__, **dict.fromkeys(kind.__dataclass_fields__, "")} for kind in kinds]
+    return [CAMERA] * len(known) + updates * 3 + known
+
+
+def test_only_what_the_page_sends_comes_in(viewed: ViewedRun, monkeypatch: pytest.MonkeyPatch) -> None:
+    shared: list[object] = []
+    monkeypatch.setattr(viser.ViserServer, "request_share_url", lambda self: shared.append(self))
+    with showing(viewed) as viewer, connected(viewer) as socket:
+        drawn(viewer, 1)
+        [(page, _)] = viewer._pages.values()
+        control = page.controls["opacity"]
+        update = {"type": "GuiUpdateMessage", "uuid": control._impl.uuid}
+        socket.send(msgpack.encode({"type": "ShareUrlRequest"}))
+        socket.send(msgpack.encode({**update, "updates": {"max": 5.0, "value": 0.2}}))
+        socket.send(msgpack.encode({**update, "updates": {"update_cb": [1]}}))
+        socket.send(msgpack.encode({**update, "updates": {"value": 0.5}}))
+        until(lambda: control.value == 0.5)
+        assert control.max == 0.95
+        assert not shared, "a page is not brought to the internet because a client asks for it"
+
+
+@pytest.mark.parametrize(("count", "seed"), [(FEW, 0), pytest.param(MANY, SEED, marks=pytest.mark.slow)])
+def test_messages_at_random(
+    viewed: ViewedRun, count: int, seed: int, capfd: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    with showing(viewed) as viewer, connected(viewer) as looker:
+        drawn(viewer, 1)
+        for round in range(count // 50):
+            attacker = connected(viewer)
+            drawn(viewer, 2)
+            own = messages_of(viewer)
+            for number in range(50):
+                rng = random.Random(f"message {seed} {round} {number}")
+                with suppress(OverflowError):
+                    data = msgpack.encode(mutated_value(rng.choice(own), rng))
+                    data = data if rng.random() < 0.8 else mutated_bytes(data, rng)
+                    try:
+                        attacker.send(data)
+                    except ConnectionClosed:
+                        attacker = connected(viewer)
+            attacker.close()
+            with suppress(TimeoutError), create_connection(looker.remote_address[:2], 0.2) as raw:
+                raw.sendall(rng.randbytes(200))
+                raw.recv(1000) and raw.recv(1000)
+            drawn(viewer, 1)
+        looker.send(msgpack.encode(CAMERA | {"position": [0.0, 0.0, -2.0]}))
+        until(lambda: any(page.eye == (0.0, 0.0, -2.0) for page, _ in dict(viewer._pages).values()))
+    said = capfd.readouterr()
+    assert "Traceback" not in said.err + said.out + caplog.text, (said, caplog.text)
+    assert "Task" not in said.err + said.out, said
+    assert "is not drawn any more" not in caplog.text, caplog.text
