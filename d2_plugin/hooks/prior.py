@@ -319,7 +319,7 @@ class PriorLoader:
                 view.camera, view.frame, ", ".join(map(str, getattr(self.store, "cameras", ()))) or "unknown",
             )  # fmt: skip
 
-    def underway(self, view: View, instants: Sequence[View], quarter: int = 2) -> tuple[View, DepthPrior] | None:
+    def underway(self, view: View, instants: Sequence[View], quarter: int = 2) -> tuple[View, Kept] | None:
         """The view 1, 2 or 3 quarters of the way to the next of a camera's `instants`, and what is stored of it, cut to
         what moves.
 
@@ -345,7 +345,7 @@ class PriorLoader:
         K[:2, 2] -= K.new_tensor([columns.start, rows.start])
         time = view.time + quarter / 4 * (following.time - view.time)
         size = {"width": columns.stop - columns.start, "height": rows.stop - rows.start}
-        return replace(view, time=time, K=K, **size), kept.prior(view.K.device)
+        return replace(view, time=time, K=K, **size), kept
 
     def believed(self, prior: DepthPrior) -> DepthPrior:
         """What of a prior is believed."""

@@ -57,7 +57,8 @@ def shown(adapter: object, time: float) -> Tensor:
 
 
 def test_what_is_looked_at_between_two_instants_is_what_moves_and_a_rim() -> None:
-    view, prior = PriorLoader(Halfway()).underway(FIRST, [FIRST, SECOND])
+    view, kept = PriorLoader(Halfway()).underway(FIRST, [FIRST, SECOND])
+    prior = kept.prior(torch.device("cpu"))
     assert (view.width, view.height) == (WIDTH // 4 + RIM, HEIGHT)
     assert prior.depth.shape == prior.colors.shape[:2] == (HEIGHT, view.width)
     still = Halfway()
