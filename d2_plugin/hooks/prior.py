@@ -342,7 +342,8 @@ class PriorLoader:
             return None
         rows, columns = part
         K = view.K.clone()
-        K[:2, 2] -= K.new_tensor([columns.start, rows.start])
+        K[0, 2] -= columns.start
+        K[1, 2] -= rows.start
         time = view.time + quarter / 4 * (following.time - view.time)
         size = {"width": columns.stop - columns.start, "height": rows.stop - rows.start}
         return replace(view, time=time, K=K, **size), kept
@@ -371,12 +372,12 @@ class PriorLoader:
 
 def _moving_part(maps: DepthPrior) -> tuple[slice, slice] | None:
     """Rows and columns that hold all pixels with a depth, which are those that move, and a rim; None without any."""
-    some = maps.depth != 0
-    if not bool(some.any()):
+    sides = torch.nonzero(maps.depth, as_tuple=True)
+    if not len(sides[0]):
         return None
-    ends = [torch.nonzero(some.any(axis)).squeeze(-1)[[0, -1]].tolist() for axis in (1, 0)]
+    first, last = ([int(end) for end in ends] for ends in zip(*(side.aminmax() for side in sides)))
     rows, columns = (
-        slice(max(first - RIM, 0), min(last + RIM + 1, size)) for (first, last), size in zip(ends, some.shape)
+        slice(max(a - RIM, 0), min(b + RIM + 1, size)) for a, b, size in zip(first, last, maps.depth.shape)
     )
     return rows, columns
 

@@ -17,6 +17,7 @@ import numpy as np
 
 from d2_plugin.priors.extras import opencv
 from d2_plugin.priors.scene_flow import (
+    STILL_INSTANTS,
     Flight,
     Region,
     common_acceleration,
@@ -92,7 +93,7 @@ class CameraMotion:
         record = store.camera(name, store.frames[0])
         assert record is not None, "a prior of this version describes its camera"
         self.camera = record
-        chosen = np.unique(np.linspace(0, len(store.frames) - 1, 9).round().astype(int))
+        chosen = np.unique(np.linspace(0, len(store.frames) - 1, STILL_INSTANTS).round().astype(int))
         self.still = still_image([self._image(store.frames[index]) for index in chosen])
         self.regions: list[list[Region]] = []
         for first, second in zip(store.frames, store.frames[1:]):

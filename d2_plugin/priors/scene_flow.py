@@ -47,9 +47,8 @@ FEWEST_AGREEING = 8
 
 
 def still_image(images: Sequence[np.ndarray]) -> np.ndarray:
-    """What a camera sees where nothing moves, [H, W, 3] float32: the median of some of its images over time."""
-    chosen = np.unique(np.linspace(0, len(images) - 1, STILL_INSTANTS).round().astype(int))
-    return np.median([images[index] for index in chosen], axis=0).astype(np.float32)
+    """What a camera sees where nothing moves, [H, W, 3] float32: the median of `STILL_INSTANTS` of its images."""
+    return np.median(images, axis=0).astype(np.float32)
 
 
 def foreground(image: np.ndarray, still: np.ndarray) -> np.ndarray:
