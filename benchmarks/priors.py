@@ -3,7 +3,8 @@ depth.
 
 The prior is built with the default settings, as `d2 priors` does, and every finite sigma is held against the error that
 the pixel has. A normal error lies within sigma at 68 % and within 2 sigma at 95 % of the pixels; 60 to 80 % and at
-least 90 % count as calibrated. `python -m benchmarks report` draws the reliability diagram of the rows.
+least 90 % count as calibrated. Of rendered rigs scene flow and what lies between two instants are held against truth as
+well. `python -m benchmarks report` draws the reliability diagram of the rows.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 import torch
 
+from benchmarks.priors_motion import motion_errors
 from benchmarks.rows import begin_rows
 from benchmarks.stereo_rigs import ARCS
 from d2_plugin.errors import D2Error, unknown_name
@@ -43,6 +45,8 @@ RENDERED = tuple(f"synthetic{views}" for views in ARCS)
 RENDERED_FRAMES = 24
 FAR = "far"
 """Method of the row about far pixels, which every case has."""
+MOTION = "motion"
+"""Method of the row about scene flow and what lies between instants, which rendered rigs have."""
 
 
 @dataclass(frozen=True)
@@ -85,8 +89,24 @@ def run(settings: PriorsBench) -> str:
     prior_settings = PriorSettings(mono_onnx=settings.mono_onnx, mono_kind=settings.mono_kind)
     for case in cases(settings):
         found, seconds = measure(case, prior_settings)
-        append_rows(settings.output, rows_of(case, found, seconds, command))
+        rows = rows_of(case, found, seconds, command)
         shown_text.append(f"{case.name}, {seconds:.2f} s per image, {found}")
+        if case.recording.name in RENDERED:
+            views = int(case.recording.name.removeprefix("synthetic"))
+            motion = motion_errors(views, settings.width, ARCS[views], prior_settings)
+            shown_text[-1] += f"\n{motion}"
+            rows.append(
+                make_row(
+                    "priors",
+                    case.name,
+                    MOTION,
+                    error=1 - motion.right,
+                    seconds=seconds,
+                    command=command,
+                    **motion.row(),
+                )
+            )
+        append_rows(settings.output, rows)
         logger.info("the prior of %s is measured", case.name)
     return "\n\n".join([*shown_text, f"rows are in {settings.output}; `python -m benchmarks report` draws them"])
 

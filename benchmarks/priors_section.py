@@ -23,7 +23,11 @@ def priors(rows: Sequence[Row]) -> Section:
     cases = dict.fromkeys(row["case"] for row in curves)
     plots = [_diagram(case, [row for row in curves if row["case"] == case], ends) for case in cases]
     emulated = any(row.get("mono_emulated") for row in rows)
-    tables = [("Errors within the declared sigma", _calibration_table(rows)), ("Far pixels", _far_table(rows))]
+    tables = [
+        ("Errors within the declared sigma", _calibration_table(rows)),
+        ("Far pixels", _far_table(rows)),
+        ("What moves: scene flow, and what lies between two instants", _motion_table(rows)),
+    ]
     return Section(
         "priors",
         "Priors: declared against true error",
@@ -79,6 +83,25 @@ def _far_table(rows: Sequence[Row]) -> Table:
     header = ("recording", "far, of pixels without true depth", "far, of the others")
     found = [row for row in rows if row.get("false_far") is not None]
     return Table(header, tuple((row["case"], _percent(row, "sky_found"), _percent(row, "false_far")) for row in found))
+
+
+def _motion_table(rows: Sequence[Row]) -> Table:
+    """Flow, and colours and depth at three quarters between instants, at pixels that move."""
+    header = ("recording", "flow right within 1 px", "median error px", "known between", "PSNR of it", "with depth")
+    shares = ("motion_with_depth", "motion_within", "motion_within_two", "motion_sigma", "motion_error")
+    cells = tuple(
+        (
+            row["case"],
+            _percent(row, "motion_right"),
+            f"{row['motion_flow_error']:.2f}",
+            _percent(row, "motion_known"),
+            f"{row['motion_psnr']:.2f}",
+            *(_percent(row, name) for name in shares),
+        )
+        for row in rows
+        if row.get("motion_right") is not None
+    )
+    return Table((*header, "within sigma", "within 2 sigma", "median sigma", "median error"), cells)
 
 
 def _percent(row: Mapping[str, float | None], name: str) -> str:

@@ -104,7 +104,7 @@ class Context:
         """What lies halfway from each view of `evaluation` to the camera's next instant, where it is to be known."""
         seen = [surveyed.view for surveyed in self.evaluation] if self.inserts_halfway else []
         pairs = [pair for view in seen if (pair := self.prior.underway(view, self.instants(view.camera))) is not None]
-        return [self._survey(view, self.prior.believed(prior)) for view, prior in pairs]
+        return [self._survey(view, self.prior.believed(kept.prior(view.K.device))) for view, kept in pairs]
 
     @torch.no_grad()
     def _survey(self, view: View, prior: DepthPrior) -> Surveyed:

@@ -17,7 +17,8 @@ import torch
 from torch import Tensor
 
 from d2_plugin.hooks.hook import Context, Hook, HookConfig
-from d2_plugin.protocol import Backbone, DepthPrior, Label, View, call_optional
+from d2_plugin.hooks.prior import Kept
+from d2_plugin.protocol import Backbone, Label, View, call_optional
 from d2_plugin.rasterizer import rasterize
 from d2_plugin.settings import Every, Range, Share, Steps
 
@@ -36,7 +37,7 @@ class MotionConfig(HookConfig):
     stop: Steps | None = None
     """First step at which it is no longer added; none: to the end."""
     every: Every = 1
-    """Steps between additions. Each costs a render with gradients."""
+    """Steps between additions. Each costs a render, with gradients, of the part that moves."""
     weight: Annotated[float, Range(0, 1e6)] = 1.0
     """Weight beside the trainer's own photometric loss."""
     ssim_weight: Share = 0.2
@@ -64,19 +65,20 @@ class Motion(Hook):
         known = [term for term in terms if term is not None]
         return self.config.weight * torch.stack(known).mean() if known else None
 
-    def _term(self, backbone: Backbone, view: View, prior: DepthPrior) -> Tensor | None:
+    def _term(self, backbone: Backbone, view: View, kept: Kept) -> Tensor | None:
         from d2_plugin.gaussians.photometric import photometric_loss  # a trainer without this hook needs none of it
 
         splats = backbone.slice_at(view)
-        colors = call_optional(backbone, "colors", view, splats)
+        colors, prior = call_optional(backbone, "colors", view, splats), kept.maps.codes
         if colors is None or prior.colors is None:
             log.warning("motion supervises nothing: the backbone has no `colors`, see d2_plugin.protocol.Backbone")
             self._colorless = True
             return None
         render = rasterize(splats, colors, view, backbone.settings)
-        image = prior.colors.to(render.color) / 255
+        shown, labels = (part.to(view.K.device, non_blocking=True) for part in (prior.colors, prior.labels))
+        image = shown.to(render.color) / 255
         # A background that is not known shows what the image shows.
         unknown = render._replace(color=render.color + (1 - render.alpha)[..., None] * image)
         color = call_optional(backbone, "behind", render, view, default=unknown).color
-        moved = (prior.labels != Label.CONFLICT)[..., None]
+        moved = (labels != Label.CONFLICT)[..., None]
         return photometric_loss(color, torch.where(moved, image, color.detach()), self.config.ssim_weight)

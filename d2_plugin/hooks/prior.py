@@ -64,6 +64,9 @@ OUTLINE = 2
 """Pixels along the outline of a sky that say nothing: a Gaussian a pixel wide, two pixels inside of the surface, would
 else stand in free space."""
 
+RIM = 8
+"""Pixels around what moves between two instants that are looked at with it: SSIM reaches 5 far."""
+
 FOCAL_TOLERANCE = 0.01
 """Largest relative difference of focal lengths."""
 
@@ -187,6 +190,12 @@ class Kept(NamedTuple):
         kind = known.kind.pin_memory() if pin and not known.kind.is_cuda else known.kind
         return cls(read._replace(codes=maps), known._replace(kind=kind))
 
+    @classmethod
+    def cut(cls, read: CodedPrior, part: tuple[slice, slice]) -> Kept:
+        """Those rows and columns of what lies between two instants."""
+        codes = DepthPrior._make(None if one is None else one[part].clone() for one in read.codes)
+        return cls(read._replace(codes=codes), KnownMaps.of(codes, UNKNOWN if read.range is not None else math.inf))
+
     @property
     def bytes(self) -> int:
         """What it takes."""
@@ -225,7 +234,7 @@ class PriorLoader:
         self.store, self.keep_bytes, self._rename, self.believe = store, memory_mb << 20, rename, believe
         # By camera and frame; frame + 0.5 is halfway to the next.
         self._kept: OrderedDict[tuple[str, float], Kept | None] = OrderedDict()
-        self._next: dict[Key, int] = {}
+        self._next: dict[tuple[str, float], tuple[int, torch.Size, tuple[slice, slice] | None]] = {}
         self._bytes = 0
         self._reading: dict[Key, Future[Kept | None]] = {}
         self._thread: ThreadPoolExecutor | None = None
@@ -314,10 +323,11 @@ class PriorLoader:
                 view.camera, view.frame, ", ".join(map(str, getattr(self.store, "cameras", ()))) or "unknown",
             )  # fmt: skip
 
-    def underway(self, view: View, instants: Sequence[View], quarter: int = 2) -> tuple[View, DepthPrior] | None:
-        """The view 1, 2 or 3 quarters of the way to the next of a camera's `instants`, and what is stored of it.
+    def underway(self, view: View, instants: Sequence[View], quarter: int = 2) -> tuple[View, Kept] | None:
+        """The view 1, 2 or 3 quarters of the way to the next of a camera's `instants`, and what is stored of it, cut to
+        what moves.
 
-        None where the store has none, or the next instant has not been seen yet.
+        None where the store has none, nothing moves, or the next instant has not been seen yet.
         """
         key = (view.camera, view.frame + quarter / 4)
         if key not in self._kept:
@@ -325,16 +335,22 @@ class PriorLoader:
             stored = call_optional(self.store, name, view.camera, view.frame, quarter)
             if stored is None:
                 return None
-            self._next[view.camera, view.frame] = stored[0]
             coded = stored[1] if isinstance(stored[1], CodedPrior) else CodedPrior(stored[1], None)
-            self._keep(key, Kept(coded, KnownMaps.of(coded.codes, UNKNOWN if coded.range is not None else math.inf)))
+            part = _moving_part(coded.codes)
+            self._next[key] = stored[0], coded.codes.depth.shape, part
+            self._keep(key, None if part is None else Kept.cut(coded, part))
         self._kept.move_to_end(key)
-        frame, kept = self._next[view.camera, view.frame], self._kept[key]
+        (frame, shape, part), kept = self._next[key], self._kept[key]
         following = next((other for other in instants if other.frame == frame), None)
-        if following is None or kept is None or kept.known.kind.shape != (view.height, view.width):
+        if following is None or kept is None or part is None or shape != (view.height, view.width):
             return None
-        between = replace(view, time=view.time + quarter / 4 * (following.time - view.time))
-        return between, kept.prior(view.K.device)
+        rows, columns = part
+        K = view.K.clone()
+        K[0, 2] -= columns.start
+        K[1, 2] -= rows.start
+        time = view.time + quarter / 4 * (following.time - view.time)
+        size = {"width": columns.stop - columns.start, "height": rows.stop - rows.start}
+        return replace(view, time=time, K=K, **size), kept
 
     def believed(self, prior: DepthPrior) -> DepthPrior:
         """What of a prior is believed."""
@@ -356,6 +372,18 @@ class PriorLoader:
         image, colors = self.images.pop((view.camera, view.frame), None), kept.maps.codes.colors
         if image is not None and colors is not None:
             check_colors(view, image, colors)
+
+
+def _moving_part(maps: DepthPrior) -> tuple[slice, slice] | None:
+    """Rows and columns that hold all pixels with a depth, which are those that move, and a rim; None without any."""
+    sides = torch.nonzero(maps.depth, as_tuple=True)
+    if not len(sides[0]):
+        return None
+    first, last = ([int(end) for end in ends] for ends in zip(*(side.aminmax() for side in sides)))
+    rows, columns = (
+        slice(max(a - RIM, 0), min(b + RIM + 1, size)) for a, b, size in zip(first, last, maps.depth.shape)
+    )
+    return rows, columns
 
 
 def _outline(far: Tensor) -> Tensor:

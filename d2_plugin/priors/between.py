@@ -17,6 +17,7 @@ import numpy as np
 
 from d2_plugin.priors.extras import opencv
 from d2_plugin.priors.scene_flow import (
+    STILL_INSTANTS,
     Flight,
     Region,
     common_acceleration,
@@ -31,7 +32,7 @@ from d2_plugin.store.files import hash_of
 from d2_plugin.store.maps import FusedPrior, empty_prior
 from d2_plugin.store.store import QUARTERS, PriorStore
 
-VERSION = 3
+VERSION = 4
 """Of what is made from the same priors; raise it when that changes."""
 
 MOVES = 0.6
@@ -67,7 +68,7 @@ def build_between(store: PriorStore, progress: Callable[[int], None] | None = No
     ]
     if all(folder.find_current(camera, first, key) for folder, camera, first in entries):
         return 0
-    cameras = [_Camera(store, name) for name in store.cameras]
+    cameras = [CameraMotion(store, name) for name in store.cameras]
     even = len({second - first for first, second in pairs}) == 1
     flights = [flight for camera in cameras for interval in camera.flights for flight in interval if flight is not None]
     acceleration = common_acceleration(flights) if even else None
@@ -84,7 +85,7 @@ def build_between(store: PriorStore, progress: Callable[[int], None] | None = No
     return done
 
 
-class _Camera:
+class CameraMotion:
     """One camera of a store, and the regions that dense flow loses in each interval."""
 
     def __init__(self, store: PriorStore, name: str) -> None:
@@ -92,12 +93,12 @@ class _Camera:
         record = store.camera(name, store.frames[0])
         assert record is not None, "a prior of this version describes its camera"
         self.camera = record
-        chosen = np.unique(np.linspace(0, len(store.frames) - 1, 9).round().astype(int))
+        chosen = np.unique(np.linspace(0, len(store.frames) - 1, STILL_INSTANTS).round().astype(int))
         self.still = still_image([self._image(store.frames[index]) for index in chosen])
         self.regions: list[list[Region]] = []
         for first, second in zip(store.frames, store.frames[1:]):
-            earlier, later = self._image(first), self._image(second)
-            self.regions.append(regions(earlier, later, self.still, *_flows(earlier, later)))
+            images = self._image(first), self._image(second)
+            self.regions.append(regions(*images, self.still, *_flows(*images)))
         self.flights = [[self._flight(index, region) for region in each] for index, each in enumerate(self.regions)]
 
     def underway(self, index: int, acceleration: np.ndarray | None) -> dict[int, FusedPrior]:
@@ -110,21 +111,27 @@ class _Camera:
             return dict.fromkeys(QUARTERS, replace(empty_prior(changed.shape), labels=unknown, colors=images[0]))
         for image in images:
             changed |= foreground(image, self.still)
-        bends = [self._bend(flight, acceleration) for flight in self.flights[index]]
-        flows = _flows(*images)
-        made = {}
-        for quarter in QUARTERS:
-            sides, part = [], quarter / 4
-            for flow, which, prior, share in zip(flows, ("start", "end"), priors, (part, 1 - part)):
-                steps, layer = share * flow, (np.hypot(flow[..., 0], flow[..., 1]) > MOVES).astype(np.uint8)
-                for region, bend in zip(self.regions[index], bends):
-                    pixels = np.unravel_index(getattr(region, which), region.shape)
-                    way = region.shift if which == "start" else -region.shift
-                    steps[pixels] = share * way + 4 * part * (1 - part) * bend
-                    layer[pixels] = 2
-                sides.append(_Side(prior, steps, layer, 1 - share))
-            made[quarter] = _composed(sides, changed)
-        return made
+        flows, bends = _flows(*images), [self._bend(flight, acceleration) for flight in self.flights[index]]
+        return {quarter: _composed(self._sides(index, flows, bends, quarter / 4), changed) for quarter in QUARTERS}
+
+    def flow(self, index: int) -> np.ndarray:
+        """How far each pixel goes from one instant of an interval to the next, [H, W, 2] pixels."""
+        flows = _flows(*(self._image(frame) for frame in self.store.frames[index : index + 2]))
+        return self._sides(index, flows, [np.zeros(2)] * len(self.regions[index]), 1.0)[0].steps
+
+    def _sides(self, index: int, flows: Sequence[np.ndarray], bends: Sequence[np.ndarray], part: float) -> list[_Side]:
+        """Both instants of an interval, their pixels moved to where they are when that part of it has passed."""
+        priors = [self._prior(frame) for frame in self.store.frames[index : index + 2]]
+        sides = []
+        for flow, which, prior, share in zip(flows, ("start", "end"), priors, (part, 1 - part)):
+            steps, layer = share * flow, (np.hypot(flow[..., 0], flow[..., 1]) > MOVES).astype(np.uint8)
+            for region, bend in zip(self.regions[index], bends):
+                pixels = np.unravel_index(getattr(region, which), region.shape)
+                way = region.shift if which == "start" else -region.shift
+                steps[pixels] = share * way + 4 * part * (1 - part) * bend
+                layer[pixels] = 2
+            sides.append(_Side(prior, steps, layer, 1 - share))
+        return sides
 
     def _flight(self, index: int, region: Region) -> Flight | None:
         """The region's way in the world, with that of the same region in the intervals beside; None without depth."""
@@ -182,7 +189,9 @@ def _composed(sides: Sequence[_Side], changed: np.ndarray) -> FusedPrior:
     accounts = [2 * side.weight * _account(side) for side in sides]
     both = np.minimum(accounts[0][..., 3], accounts[1][..., 3]) > 1e-2 * LAYERS[0]
     colors = [account[..., :3] / np.maximum(account[..., 3:], 1e-9) for account in accounts]
-    differ = both & (np.abs(colors[0] - colors[1]).max(-1) > CONTRADICTS)
+    # A region that was found back is there, whatever its colours: a ball spins.
+    found = np.minimum(accounts[0][..., 3], accounts[1][..., 3]) > 0.1 * LAYERS[2]
+    differ = both & ~found & (np.abs(colors[0] - colors[1]).max(-1) > CONTRADICTS)
     together = accounts[0] + accounts[1]
     known = together[..., 3] > 0.1 * LAYERS[0]
     unknown = ~known | (opencv("scene flow").blur(differ.astype(np.float32), (3, 3)) > 0.3)

@@ -34,8 +34,10 @@ REACH = 5
 """A region is searched within the image's width over this."""
 LANDS_BESIDE = 40.0
 """What is added to a match's root mean square difference if none of it lands on foreground."""
-WORST_MATCH = 32.0
-"""Largest such cost of a match."""
+WORST_MATCH, WORST_ALONE = 32.0, 45.0
+"""Largest such cost of a match; of one that lands on a thing of its own size. A striped ball that turns costs 40."""
+ALONE = 0.6
+"""It does where it covers more than this share of the foreground components that it touches."""
 FAST = 0.7
 """A region is fast that goes further than this many of its radii."""
 AGREE = 0.35
@@ -45,9 +47,8 @@ FEWEST_AGREEING = 8
 
 
 def still_image(images: Sequence[np.ndarray]) -> np.ndarray:
-    """What a camera sees where nothing moves, [H, W, 3] float32: the median of some of its images over time."""
-    chosen = np.unique(np.linspace(0, len(images) - 1, STILL_INSTANTS).round().astype(int))
-    return np.median([images[index] for index in chosen], axis=0).astype(np.float32)
+    """What a camera sees where nothing moves, [H, W, 3] float32: the median of `STILL_INSTANTS` of its images."""
+    return np.median(images, axis=0).astype(np.float32)
 
 
 def foreground(image: np.ndarray, still: np.ndarray) -> np.ndarray:
@@ -120,7 +121,8 @@ def regions(
         for mask in _pieces(masks[0], unexplained):
             shift, cost = _match(*images, mask, masks[1])
             landed = _moved(mask, shift) & masks[1]
-            if cost > WORST_MATCH or np.hypot(*shift) < 3 or landed.sum() <= SMALLEST:
+            worst = WORST_ALONE if _lands_alone(landed, masks[1]) else WORST_MATCH
+            if cost > worst or np.hypot(*shift) < 3 or landed.sum() <= SMALLEST:
                 continue
             back_again, _ = _match(*images[::-1], landed, masks[0])
             if np.abs(shift + back_again).sum() <= 3:
@@ -141,6 +143,12 @@ def _pieces(front: np.ndarray, unexplained: np.ndarray) -> Iterator[np.ndarray]:
         elif share > 0:
             for part in _components(unexplained & component, 20):
                 yield (cv2.dilate(part.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0) & component
+
+
+def _lands_alone(landed: np.ndarray, front: np.ndarray) -> bool:
+    """Whether what pixels land on is a thing of their size, not part of a larger one."""
+    labels = opencv("scene flow").connectedComponents(front.astype(np.uint8))[1]
+    return bool(landed.sum() > ALONE * np.isin(labels, np.unique(labels[landed])).sum())
 
 
 def _components(mask: np.ndarray, least: int) -> Iterator[np.ndarray]:

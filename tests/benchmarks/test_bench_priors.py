@@ -69,13 +69,17 @@ def test_a_rendered_rig_is_measured_without_any_data(measured: tuple[str, list[R
     assert "synthetic4, 4 views" in told
     assert "held against the true depth of 4 views" in told
     assert {row["kind"] for row in rows} == {"priors"}
-    assert [row["method"] for row in rows] == ["verified", "agreed", "mono only", "far"]
-    for row in rows[:-1]:
+    assert [row["method"] for row in rows] == ["verified", "agreed", "mono only", "far", "motion"]
+    for row in rows[:3]:
         assert row["error"] == pytest.approx(abs(row["within"] - NORMAL_SHARE))
         assert 0 < row["share"] < 1
         assert row["seconds"] > 0
         assert row["mono_emulated"]
         assert all(len(point) == 3 for point in row["curve"])
+    motion = rows[4]
+    assert 0.2 < motion["motion_right"] < motion["motion_known"] < 1
+    assert motion["motion_psnr"] > 15
+    assert 0 < motion["motion_within"] < motion["motion_within_two"] < 1
     assert rows[0]["command"] == ("d2 bench priors --rigs synthetic4 --frames 0 --width 96 --output runs.jsonl"), (
         "no folder of this machine"
     )
@@ -114,11 +118,12 @@ def test_the_diagram_has_a_mark_per_bin_and_the_diagonal(measured: tuple[str, li
     _, rows = measured
     make_report(rows, tmp_path, builders={"priors": priors})
     svg, text = (tmp_path / "priors.svg").read_text(), (tmp_path / "report.md").read_text()
-    assert len(marks(svg)) == sum(len(row["curve"]) for row in rows[:-1]) > 0
+    assert len(marks(svg)) == sum(len(row["curve"]) for row in rows[:3]) > 0
     assert DIAGONAL in svg
     assert "true error, 68 % quantile" in svg
     assert "| synthetic4, 4 views | mono only |" in text
     assert "emulated, not predicted" in text
+    assert "What moves: scene flow, and what lies between two instants" in text
 
 
 def test_a_recording_without_any_label_has_a_row_and_no_curve() -> None:

@@ -13,7 +13,7 @@ from d2_plugin.backbones.trainer import Trainer, TrainSettings
 from d2_plugin.config import D2Config, DensifyConfig, MotionConfig
 from d2_plugin.hooks.hook import Context
 from d2_plugin.hooks.motion import Motion
-from d2_plugin.hooks.prior import PriorLoader
+from d2_plugin.hooks.prior import RIM, PriorLoader
 from d2_plugin.plugin import D2Hooks
 from d2_plugin.protocol import DepthPrior, Label, View
 
@@ -54,6 +54,30 @@ def loss_of(adapter: object, store: object | None = None, step: int = 2, **chang
 def shown(adapter: object, time: float) -> Tensor:
     """What the backbone renders of the first camera, with its background."""
     return adapter.model.render(replace(FIRST, time=time)).color.detach()
+
+
+def test_what_is_looked_at_between_two_instants_is_what_moves_and_a_rim() -> None:
+    view, kept = PriorLoader(Halfway()).underway(FIRST, [FIRST, SECOND])
+    prior = kept.prior(torch.device("cpu"))
+    assert (view.width, view.height) == (WIDTH // 4 + RIM, HEIGHT)
+    assert prior.depth.shape == prior.colors.shape[:2] == (HEIGHT, view.width)
+    still = Halfway()
+    still.underway = lambda *_: (1, Halfway().underway("", 0, 2)[1]._replace(depth=torch.zeros(HEIGHT, WIDTH)))
+    assert PriorLoader(still).underway(FIRST, [FIRST, SECOND]) is None
+
+
+def test_a_part_in_the_middle_shows_the_same_pixels() -> None:
+    store, part = Halfway(), Halfway()
+    labels = torch.zeros(HEIGHT, WIDTH, dtype=torch.uint8)
+    labels[HEIGHT // 2, WIDTH // 2] = Label.VERIFIED
+    prior = store.underway("", 0, 2)[1]._replace(labels=labels, depth=2.5 * (labels > 0))
+    part.underway = lambda *_: (1, prior)
+    view, _ = PriorLoader(part).underway(FIRST, [FIRST, SECOND])
+    rows, columns = (slice(max(size // 2 - RIM, 0), size // 2 + RIM + 1) for size in (HEIGHT, WIDTH))
+    model = make_model()
+    whole = model.render(replace(FIRST, time=view.time)).color
+    # Gaussians far beside the image are clamped there, hence no closer.
+    torch.testing.assert_close(model.render(view).color, whole[rows, columns], atol=1e-2, rtol=0)
 
 
 @pytest.mark.parametrize("backbone", ["yang4d", "mlp"])

@@ -70,6 +70,20 @@ def render_depth(scene: Scene, camera: Camera, seconds: float) -> np.ndarray:
     return distance.reshape(camera.height, camera.width).astype(np.float32)
 
 
+def render_flow(scene: Scene, camera: Camera, seconds: float, later: float) -> np.ndarray:
+    """Exact scene flow float32 [H, W, 3]: how far in the world what each pixel shows goes from one time to another."""
+    directions = _directions(camera, (0.5, 0.5))
+    distance, owner = _first_hits(scene, camera, directions, seconds)
+    points = camera.centre[:, None] + distance * directions
+    flow = np.zeros_like(points)
+    for index, solid in enumerate(scene.solids):
+        rays = np.flatnonzero(owner == index)
+        (rotation, centre), (turned, moved) = solid.motion(seconds), solid.motion(later)
+        local = rotation.T @ (points[:, rays] - centre[:, None])
+        flow[:, rays] = turned @ local + moved[:, None] - points[:, rays]
+    return flow.T.reshape(camera.height, camera.width, 3).astype(np.float32)
+
+
 def _directions(camera: Camera, offset: tuple[float, float]) -> np.ndarray:
     """World directions [3, H * W] with camera z = 1 through the point `offset` of every pixel."""
     x = (np.arange(camera.width) + offset[0] - camera.K[0, 2]) / camera.K[0, 0]
