@@ -76,7 +76,7 @@ def check_view(view: View) -> None:
         if not isinstance(matrix, Tensor) or tuple(matrix.shape) != shape:
             got = tuple(matrix.shape) if isinstance(matrix, Tensor) else type(matrix).__name__
             raise D2Error(f"{what} of {name} is {got}, expected a tensor {shape}: mend the adapter's view()")
-        if matrix.is_meta or not bool(torch.isfinite(matrix).all()):
+        if not bool(torch.isfinite(matrix).all()):
             raise D2Error(f"{what} of {name} has a number that is not finite: correct the camera")
     fx, fy = float(K[0, 0]), float(K[1, 1])
     if not (fx > 0 and fy > 0):
