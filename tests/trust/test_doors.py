@@ -132,7 +132,7 @@ FLAGS = """
 --densify.spacing 10000000000000000000000000 | --densify.tau-u 10000000000000000000000000
 --prune.patience 1000000000 | --depth-loss.epsilon 10000000000000000000000000 | --depth-loss.epsilon 1e-320
 --prune.tau-u 1e-320 | --priors.stereo.patchmatch-sources 2000000000 | --priors.stereo.min-sources 2000000000
---priors.mono-threads 1000000000 | --priors.stereo.max-pixels 1000000000000 | --priors.stereo.colmap-minutes 1e300
+--priors.mono-threads 1000000000 | --priors.stereo.max-pixels 1000000000000
 --priors.stereo.reuse-block 1e25 | --priors.tau-c 1e300 | --priors.conflict-sigmas 1e-320
 --priors.align.epsilon 1e-320 | --priors.align.min-anchors 1e25 | --priors.depth-range 1e-320,1
 --priors.depth-range 1,1e300 | --backbone.sh-time-degree 10000000000000000000000000 | --backbone.position-rate 1e38

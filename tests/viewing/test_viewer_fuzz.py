@@ -132,7 +132,7 @@ def test_messages_at_random(
                 raw.recv(1000) and raw.recv(1000)
             drawn(viewer, 1)
         looker.send(msgpack.encode(CAMERA | {"position": [0.0, 0.0, -2.0]}))
-        until(lambda: any(page.eye == (0.0, 0.0, -2.0) for page, _ in dict(viewer._pages).values()))
+        until(lambda: any(page.last and page.last.pose[:3] == (0, 0, -2) for page, _ in dict(viewer._pages).values()))
     said = capfd.readouterr()
     assert "Traceback" not in said.err + said.out + caplog.text, (said, caplog.text)
     assert "Task" not in said.err + said.out, said
