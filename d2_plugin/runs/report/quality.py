@@ -129,9 +129,10 @@ def _method(text: str, usual: str) -> str:
 
 def _figure(groups: Sequence[Group], time: str) -> str:
     """PSNR over minutes, a plot for each recording; a method has one colour in all of them, and a line from length to
-    length. Lengths in seconds alone where there are any, since times of two campaigns do not compare, and the usual
-    backbone alone."""
+    length. Lengths in seconds alone where there are any, since times of two campaigns do not compare, the usual
+    backbone alone, and where there are such, recordings of which all instants train."""
     groups = [group for group in groups if not group.method.endswith(")")]
+    groups = [group for group in groups if "of the instants" not in group.case] or groups
     methods = sorted({group.method for group in groups}, key=_rank)
     plots = []
     for case in dict.fromkeys(group.case for group in groups):
