@@ -44,8 +44,7 @@ class Frames(Protocol):
     """The training images: views, and the image [H, W, 3] in 0..1 of each.
 
     Where there is also `image_bytes(index)`, the same as it is kept (uint8, 0..255), the loss is computed from that.
-    It may have `weights(index) -> [H, W] | None` as well: how much each pixel counts, 0..1. It may have `opened(step)`:
-    how many of the views, from the first on, are trained on at a step, where that is not all of them.
+    It may have `weights(index) -> [H, W] | None` as well: how much each pixel counts, 0..1.
     """
 
     views: Sequence[View]
@@ -138,12 +137,7 @@ class Trainer:
         return None if weights is None else weights(index)
 
     def _next_view(self) -> int:
-        """Every view once, in a new random order each time round; views that join begin a new round."""
-        opened = self._opened(self.step)
-        if not self._queue or opened > self._opened(max(self.step - 1, 1)):
-            self._queue = torch.randperm(opened, generator=self._generator).tolist()
+        """Every view once, in a new random order each time round."""
+        if not self._queue:
+            self._queue = torch.randperm(len(self.frames.views), generator=self._generator).tolist()
         return self._queue.pop()
-
-    def _opened(self, step: int) -> int:
-        opened: Callable[[int], int] | None = getattr(self.frames, "opened", None)
-        return len(self.frames.views) if opened is None else opened(step)

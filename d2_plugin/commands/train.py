@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from d2_plugin.viewing.live.show import LiveRun
 
 OF_THE_RUN = (
-    *("test_cameras", "backbone", "iterations", "hooks", "priors", "priors_in_step", "accept_empty_prior"),
+    *("test_cameras", "backbone", "iterations", "hooks", "priors", "accept_empty_prior"),
     *("hold_out_instants", "background_weight", "seed", "device"),
 )
 TABLES = ("densify", "prune", "depth_loss", "motion", "d2", "priors", "backbone", "plan", "import")

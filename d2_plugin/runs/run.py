@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -17,7 +17,6 @@ from d2_plugin.locks import only_writer
 from d2_plugin.plugin import D2Hooks
 from d2_plugin.priors.summary import PriorSummary
 from d2_plugin.progress import progress_bar
-from d2_plugin.runs.prior.alongside import OPEN_BY, PriorAlongside, alongside
 from d2_plugin.runs.prior.build import build_priors_for, refuse_unusable
 from d2_plugin.runs.prior.trials import Trials, is_open, kept_trials
 from d2_plugin.runs.rows import circumstances
@@ -77,13 +76,12 @@ class Run:
         claim(folder, self.settings.as_table() | ({} if guidance is None else {"guidance": dict(guidance.identity())}))
         self.seconds = {"priors": 0.0, "train": 0.0, "eval": 0.0}
         self.cpu_seconds = dict(self.seconds)
-        """The same in CPU time, of a prior that is built in step that of its own process."""
+        """The same in CPU time."""
         self.retired: dict[str, int] = {}
         """Hooks that stopped because they changed next to nothing, and at which step."""
         self.prior: dict[str, Any] | None = None
         """What the depth prior became, as `PriorSummary.as_dict` has it; None without one."""
         self._writes = False
-        self._building: PriorAlongside | None = None
 
     @classmethod
     @checked_arguments
@@ -99,7 +97,7 @@ class Run:
         """Whether anything that guides this run needs the depth prior."""
         return self.guidance is not None or any(name in self.settings.hooks for name in HOOK_NAMES[1:])
 
-    def prepare(self, priors: bool = True, on_prior: Callable[[PriorSummary], None] | None = None) -> TimedPoints:
+    def prepare(self, on_prior: Callable[[PriorSummary], None] | None = None) -> TimedPoints:
         """Triangulate the sparse points and build the depth prior where they are missing; returns the points.
 
         `on_prior` is called with what the prior became.
@@ -109,17 +107,14 @@ class Run:
         """
         with self._writing(), self._timed("priors"):
             points = self._points()
-            if priors and self.uses_prior:
+            if self.uses_prior:
                 between = "motion" in self.settings.hooks
-                self._take(build_priors_for(self.scene, points.positions, self._store, between=between), on_prior)
+                summary = build_priors_for(self.scene, points.positions, self._store, between=between)
+                if on_prior is not None:
+                    on_prior(summary)
+                refuse_unusable(summary, self.settings.accept_empty_prior)
+                self.prior = summary.as_dict()
         return points
-
-    def _take(self, summary: PriorSummary, on_prior: Callable[[PriorSummary], None] | None) -> None:
-        """Tell and keep what the prior became; refuse one that is of no use."""
-        if on_prior is not None:
-            on_prior(summary)
-        refuse_unusable(summary, self.settings.accept_empty_prior)
-        self.prior = summary.as_dict()
 
     def train(self, on_prior: Callable[[PriorSummary], None] | None = None, watch: Watch | None = None) -> None:
         """Build what is missing, then train to the last iteration, continuing from a checkpoint if there is one.
@@ -130,8 +125,8 @@ class Run:
             D2Error: what `prepare` refuses, another process that writes this run, a damaged file, a disk that is full.
             Diverged: the loss or a parameter is no finite number any more.
         """
-        with self._writing(), self._beside():
-            points = self.prepare(self._building is None, on_prior)
+        with self._writing():
+            points = self.prepare(on_prior)
             if self.guidance is None and is_open(self.settings, self.scene):
                 with self._timed("priors"):
                     kept_trials(self.folder / "trials.json", self.settings, self.scene, points, self.priors)
@@ -144,18 +139,14 @@ class Run:
 
                 def on_step(check: OnStep, step: int, loss: float) -> None:
                     check(step, loss)
-                    built = "" if self._building is None else f", prior {self._building.share:.0%}"
-                    bar.update(step, f"loss {loss:.4f}{built}")
+                    bar.update(step, f"loss {loss:.4f}")
                     watching(step, loss)
 
                 while trainer.step < iterations:
                     until = min((trainer.step // chunk + 1) * chunk, iterations)
                     with self._timed("train"), watched(trainer, self._checkpoint) as check:
                         trainer.run(until, partial(on_step, check))
-                    if trainer.step >= OPEN_BY * iterations:
-                        self._finish_prior(on_prior)
                     self._save(trainer)
-                self._finish_prior(on_prior)
             self.retired = {} if trainer.d2 is None else dict(trainer.d2.retired)
 
     def evaluate(self, images: bool = True) -> dict[str, Any]:
@@ -219,9 +210,7 @@ class Run:
         training = backbone.TrainSettings(iterations=self.settings.iterations, seed=self.settings.seed)
         weight = self.settings.background_weight
         images = TrainingFrames(recording, cameras, self.settings.device, background_weight=weight)
-        trainer = backbone.Trainer(model, images, training, self._attach if attach and self.uses_prior else None)
-        images.awaited = self._building  # only now: what a model begins with needs no prior
-        return trainer
+        return backbone.Trainer(model, images, training, self._attach if attach and self.uses_prior else None)
 
     def trained(self) -> Any:
         """The trainer at the last checkpoint, without hooks or a look at the prior: the checkpoint says it all."""
@@ -276,25 +265,6 @@ class Run:
                 yield
             finally:
                 self._writes = False
-
-    @contextmanager
-    def _beside(self) -> Iterator[None]:
-        """Build the prior beside the training, where the settings ask for it."""
-        wanted = self.settings.priors_in_step and self.uses_prior and self.guidance is None
-        begin = partial(alongside, self.settings, self.scene, self._store)
-        with begin(self._points().positions) if wanted else nullcontext() as self._building:
-            try:
-                yield
-            finally:
-                self._building = None
-
-    def _finish_prior(self, on_prior: Callable[[PriorSummary], None] | None) -> None:
-        """Take what the prior that is built beside became."""
-        if self._building is not None:
-            self._take(self._building.finish(), on_prior)
-            self.seconds["priors"] += self._building.seconds
-            self.cpu_seconds["priors"] += self._building.cpu_seconds
-            self._building = None
 
     @contextmanager
     def _timed(self, name: str) -> Iterator[None]:

@@ -81,8 +81,6 @@ class RunSettings(Settings):
     """Depth of all views from one network: a folder with FRAME.npz, or an ONNX file."""
     priors: str | None = None
     """Folder of a finished depth prior; without it the run builds its own."""
-    priors_in_step: bool = False
-    """Train while later frames still get their prior."""
     accept_empty_prior: bool = False
     """Train even where no view has a usable prior."""
     background_weight: Share = 1.0

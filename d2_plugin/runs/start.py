@@ -8,7 +8,7 @@ from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -106,13 +106,6 @@ def begin_with_exposures(model: Any, recording: Recording, training: Sequence[st
         begin(known, training)
 
 
-class Awaited(Protocol):
-    """What the training of a frame waits for: see `d2_plugin.runs.prior.alongside.PriorAlongside`."""
-
-    def opened(self, step: int) -> int: ...
-    def wait_for(self, frame: int) -> None: ...
-
-
 class TrainingFrames:
     """Views and images of the training cameras; decoded images are kept up to `KEPT_IMAGES`, the rest re-read."""
 
@@ -127,13 +120,7 @@ class TrainingFrames:
         self.background_weight = background_weight
         self._recorded = {camera: recording.recorded(camera) for camera in cameras}
         self.views = [make_view(recording, camera, frame, device) for frame in recording.frames for camera in cameras]
-        self.awaited: Awaited | None = None
-        """What is built while these images are trained on, if anything is."""
         self._kept: OrderedDict[int, np.ndarray] = OrderedDict()
-
-    def opened(self, step: int) -> int:
-        """How many of `views`, from the first on, are trained on at a step (from 1)."""
-        return len(self.views) if self.awaited is None else self.awaited.opened(step)
 
     def image(self, index: int) -> Tensor:
         """Image [H, W, 3] in 0..1 of `views[index]`."""
@@ -142,8 +129,6 @@ class TrainingFrames:
     def image_bytes(self, index: int) -> Tensor:
         """The same as it is kept: uint8, 0..255."""
         view = self.views[index]
-        if self.awaited is not None:
-            self.awaited.wait_for(view.frame)
         if index not in self._kept:
             self._kept[index] = self.recording.image(view.camera, view.frame)
             while len(self._kept) > 1 and sum(kept.nbytes for kept in self._kept.values()) > KEPT_IMAGES:

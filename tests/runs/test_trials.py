@@ -128,7 +128,6 @@ def test_the_user_may_choose_and_then_nothing_is_tried(room: Path, tmp_path: Pat
         {"overrides": {"d2": {"believe": "all"}}},
         {"overrides": {"priors": {"variant": "mvs"}}},
         {"hooks": ("prior",)},
-        {"priors_in_step": True},
         {"iterations": 999},
     ):
         assert not is_open(replace(settings, **changes), scene), changes

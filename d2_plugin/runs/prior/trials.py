@@ -126,9 +126,7 @@ def is_open(settings: RunSettings, scene: Scene) -> bool:
     chosen = "believe" in settings.overrides.get("d2", {})
     uses_depth = bool({"densify", "depth_loss"} & set(settings.hooks))
     both = scene.plan.uses("verification") and prior_settings(settings).variant == "dual"
-    return (
-        both and uses_depth and not chosen and not settings.priors_in_step and len(scene.train_cameras) >= LEAST_CAMERAS
-    )
+    return both and uses_depth and not chosen and len(scene.train_cameras) >= LEAST_CAMERAS
 
 
 def kept_trials(path: Path, settings: RunSettings, scene: Scene, points: TimedPoints, priors: Path) -> Trials:
