@@ -17,6 +17,7 @@ from d2_plugin.priors.build import build_priors
 from d2_plugin.priors.settings import PriorSettings
 from d2_plugin.protocol import Label
 from d2_plugin.recordings.recording import Camera
+from d2_plugin.recordings.synthetic.raycast import directions_of, first_hits
 from d2_plugin.recordings.synthetic.room import SyntheticSource, synthetic_recording
 from d2_plugin.runs.start import triangulated_points
 from d2_plugin.store.store import QUARTERS, PriorStore
@@ -127,12 +128,29 @@ def _between(store: PriorStore, source: SyntheticSource, name: str, frame: int, 
     return np.stack([known[moves], (difference**2).mean(-1)[moves], error[moves], sigma[moves]])
 
 
+def scene_flow(source: SyntheticSource, name: str, frame: int, later: int) -> np.ndarray:
+    """Exact scene flow [H, W, 3]: how far in the world what each pixel shows goes from a frame to another."""
+    camera, seconds, then = source.cameras[name], frame / source.fps, later / source.fps
+    directions = directions_of(camera, (0.5, 0.5))
+    distance, owner = first_hits(source.scene, camera, directions, seconds)
+    points = camera.centre[:, None] + distance * directions
+    flow = np.zeros_like(points)
+    for index, solid in enumerate(source.scene.solids):
+        rays = np.flatnonzero(owner == index)
+        (rotation, centre), (turned, moved) = solid.motion(seconds), solid.motion(then)
+        local = rotation.T @ (points[:, rays] - centre[:, None])
+        flow[:, rays] = turned @ local + moved[:, None] - points[:, rays]
+    return flow.T.reshape(camera.height, camera.width, 3)
+
+
 def _true_flow(source: SyntheticSource, name: str, frame: int, later: int) -> np.ndarray:
     """How far each pixel [H, W, 2] goes in the image from a frame to another."""
     camera, depth = source.cameras[name], source.depth(name, frame)
     rows, columns = np.mgrid[: camera.height, : camera.width] + 0.5
     rays = np.stack([columns, rows, np.ones_like(rows)], -1) @ np.linalg.inv(camera.K).T
-    return _seen(camera, rays * depth[..., None], source.flow(name, frame, later)) - np.stack([columns, rows], -1)
+    return _seen(camera, rays * depth[..., None], scene_flow(source, name, frame, later)) - np.stack(
+        [columns, rows], -1
+    )
 
 
 def _seen(camera: Camera, points: np.ndarray, moved: np.ndarray) -> np.ndarray:

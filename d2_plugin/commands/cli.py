@@ -55,7 +55,7 @@ COMMANDS: dict[str, str | ModuleCommand] = {
     ),
     "doctor": ModuleCommand(
         *("d2_plugin.commands.doctor", "Doctor"),
-        "What is installed and what is missing for which feature; of a recording, what it lacks.",
+        "What is installed and what is missing for which feature, or for a trainer.",
     ),
 }
 """Name -> what serves it: a module beside this file, whose docstring is the help and whose `form(words)` says what it

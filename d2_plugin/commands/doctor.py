@@ -1,4 +1,4 @@
-"""What is installed and what is missing for which feature; of a recording, what it lacks.
+"""What is installed and what is missing for which feature.
 
 With --attach REPOSITORY PATH: what that trainer imports and this environment lacks, and how to get it.
 """
@@ -33,16 +33,16 @@ OPTIONAL = {
 
 @dataclass(frozen=True)
 class Doctor(Settings):
-    """What to look at: this installation, a recording, or what a trainer needs beside it."""
+    """What to look at: this installation, or what a trainer needs beside it."""
 
     path: Annotated[Path | None, Positional()] = None
-    """A recording; with --attach the folder of a trainer's repository, or its script. Else what is installed."""
+    """With --attach: the folder of a trainer's repository, or its script."""
     attach: str | None = None
     """Name of the repository, as the launcher knows it."""
 
 
 def run(settings: Doctor) -> str:
-    """The report on this installation, on a recording, or on what a trainer needs."""
+    """The report on this installation, or on what a trainer needs."""
     if settings.attach is not None:
         if settings.path is None:
             raise D2Error("a trainer is examined by both its name and its folder: d2 doctor --attach fudan FOLDER")
@@ -50,12 +50,11 @@ def run(settings: Doctor) -> str:
         from d2_plugin.attach.recipes import recipe
 
         return needs(recipe(settings.attach), settings.path)
-    if settings.path is None:
-        return report()
-    from d2_plugin.recordings import open_recording
-    from d2_plugin.recordings.checks.lacking import lacking_text
-
-    return lacking_text(open_recording(settings.path))
+    if settings.path is not None:
+        raise D2Error(
+            f"--attach NAME is missing; of a recording, d2 plan {settings.path} --train-cameras all says more"
+        )
+    return report()
 
 
 def report() -> str:

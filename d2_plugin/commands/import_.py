@@ -16,4 +16,5 @@ def run(settings: ImportSettings) -> str:
     sizes = sorted({(camera.width, camera.height) for camera in recording.cameras.values()})
     shown = ", ".join(f"{width}x{height}" for width, height in sizes)
     about = f"{len(recording.cameras)} cameras, {len(recording.frames)} frames at {recording.rate:g} per second"
-    return f"{about}, {shown} pixels in {settings.output}\n`d2 doctor {settings.output}` says what it lacks"
+    plan = f"`d2 plan {settings.output} --train-cameras all` says what is used and what is left out"
+    return f"{about}, {shown} pixels in {settings.output}\n{plan}"

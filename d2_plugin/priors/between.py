@@ -15,7 +15,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from d2_plugin.priors.extras import opencv
 from d2_plugin.priors.scene_flow import (
     STILL_INSTANTS,
     Flight,
@@ -28,6 +27,7 @@ from d2_plugin.priors.scene_flow import (
     still_image,
 )
 from d2_plugin.protocol import CameraRecord, DepthPrior, Label
+from d2_plugin.recordings.images import opencv
 from d2_plugin.store.files import hash_of
 from d2_plugin.store.maps import FusedPrior, empty_prior
 from d2_plugin.store.store import QUARTERS, PriorStore

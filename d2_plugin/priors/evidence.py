@@ -19,8 +19,8 @@ from dataclasses import replace
 import numpy as np
 
 from d2_plugin.priors.cross_view.kernel import View, compare_views
-from d2_plugin.priors.extras import opencv
 from d2_plugin.priors.fuse import FusedPrior
+from d2_plugin.recordings.images import opencv
 from d2_plugin.recordings.recording import Camera
 
 AGREED = 0.57

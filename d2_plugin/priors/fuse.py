@@ -7,9 +7,9 @@ from typing import get_args
 import numpy as np
 
 from d2_plugin.errors import D2Error, unknown_name
-from d2_plugin.priors.extras import opencv
 from d2_plugin.priors.settings import Variant
 from d2_plugin.protocol import Label
+from d2_plugin.recordings.images import opencv
 from d2_plugin.store.maps import FusedPrior, empty_prior
 
 __all__ = [

@@ -9,10 +9,9 @@ import numpy as np
 
 from d2_plugin.arrays import read_array
 from d2_plugin.errors import D2Error
-from d2_plugin.priors.extras import opencv
 from d2_plugin.priors.geometry import viewing_rays
 from d2_plugin.recordings.files import FrameFiles, numbered_files
-from d2_plugin.recordings.images import read_numbers, shrink_depth
+from d2_plugin.recordings.images import opencv, read_numbers, shrink_depth
 from d2_plugin.recordings.recording import Camera
 
 SUFFIXES = (".npy", ".png")

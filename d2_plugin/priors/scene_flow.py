@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from d2_plugin.priors.extras import opencv
+from d2_plugin.recordings.images import opencv
 
 FINE_WIDTH = 320
 """Flow is followed, and regions are searched, in images about as wide; a wider one gives the last pixels alone."""

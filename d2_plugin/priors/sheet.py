@@ -9,9 +9,8 @@ from types import ModuleType
 import numpy as np
 
 from d2_plugin.errors import D2Error
-from d2_plugin.priors.extras import opencv
 from d2_plugin.protocol import DepthPrior, Label
-from d2_plugin.recordings.images import write_png
+from d2_plugin.recordings.images import opencv, write_png
 from d2_plugin.recordings.recording import Recording
 from d2_plugin.store.store import PriorStore
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from benchmarks.priors_motion import scene_flow
 from d2_plugin.errors import D2Error
 from d2_plugin.recordings.recording import Camera, Recording
 from d2_plugin.recordings.synthetic.raycast import render_depth
@@ -49,7 +50,7 @@ def test_depth_says_where_another_camera_sees_the_same_surface(recording: Record
 
 def test_what_moves_is_seen_later_where_its_scene_flow_says(recording: Recording) -> None:
     """Points of a frame and their flow: never in front of the depth of a later frame, mostly on it; walls stand."""
-    camera, flow = recording.cameras["train1"], recording.source.flow("train1", 0, 3).reshape(-1, 3)
+    camera, flow = recording.cameras["train1"], scene_flow(recording.source, "train1", 0, 3).reshape(-1, 3)
     moves = np.linalg.norm(flow, axis=1) > 1e-6
     assert 0.01 < moves.mean() < 0.3
     moved = (world_points(camera, recording.depth("train1", 0)) + flow)[moves]
@@ -59,7 +60,7 @@ def test_what_moves_is_seen_later_where_its_scene_flow_says(recording: Recording
     ratio = later[:, 2] / recording.depth("train1", 3)[v, u]
     assert np.mean(np.abs(ratio - 1) < 0.02) > 0.7, "what turns away is not seen any more"
     assert np.mean(ratio < 0.97) < 0.1  # only at silhouettes, by up to a pixel
-    np.testing.assert_allclose(recording.source.flow("train1", 2, 2), 0, atol=1e-6)
+    np.testing.assert_allclose(scene_flow(recording.source, "train1", 2, 2), 0, atol=1e-6)
 
 
 def test_depth_matches_the_sphere_it_is_told_to_be() -> None:

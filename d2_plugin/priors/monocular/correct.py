@@ -13,8 +13,8 @@ from types import ModuleType
 
 import numpy as np
 
-from d2_plugin.priors.extras import opencv
 from d2_plugin.priors.monocular.settings import AlignSettings
+from d2_plugin.recordings.images import opencv
 
 SCALES = (0.25, 0.12, 0.06, 0.03)
 """Standard deviations of the windows, coarse to fine, image widths."""

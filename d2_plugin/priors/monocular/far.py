@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from d2_plugin.priors.extras import opencv
+from d2_plugin.recordings.images import opencv
 
 CLEARLY = 0.4
 """Inverse depth, in units of that of the farthest anchors, below which a pixel is clearly beyond."""

@@ -18,10 +18,10 @@ from typing import Any, get_args
 import numpy as np
 
 from d2_plugin.errors import D2Error, missing_extra, unknown_name
-from d2_plugin.priors.extras import opencv
 from d2_plugin.priors.monocular.align import KINDS
 from d2_plugin.priors.settings import Preprocessing
 from d2_plugin.reading import parsing, said
+from d2_plugin.recordings.images import opencv
 from d2_plugin.recordings.recording import MonoKind
 from d2_plugin.values import shown
 

@@ -27,11 +27,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from d2_plugin.priors.extras import opencv
 from d2_plugin.priors.maps_on_disk import divided
 from d2_plugin.priors.monocular.correct import corrected_depth, corrected_without
 from d2_plugin.priors.monocular.extrapolation import extrapolation_error
 from d2_plugin.priors.settings import AlignSettings
+from d2_plugin.recordings.images import opencv
 from d2_plugin.recordings.recording import MonoKind
 
 HARDER = 1.25

@@ -9,13 +9,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from d2_plugin.errors import D2Error, unknown_name
-from d2_plugin.priors.extras import opencv
 from d2_plugin.priors.frame import Frame, digest
 from d2_plugin.priors.maps_on_disk import planar
 from d2_plugin.priors.monocular.network import MonocularModel
 from d2_plugin.priors.multiview.predicted import Predicted, declared, prediction_files, read_prediction, understood
 from d2_plugin.priors.multiview.scale import log_ratio, world_scale
 from d2_plugin.priors.settings import PriorSettings
+from d2_plugin.recordings.images import opencv
 from d2_plugin.recordings.recording import Camera, Recording
 from d2_plugin.store.files import EntryFolder, hash_of
 from d2_plugin.values import shown

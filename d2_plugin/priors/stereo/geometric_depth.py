@@ -9,12 +9,12 @@ from dataclasses import replace
 import numpy as np
 
 from d2_plugin.errors import D2Error, unknown_name
-from d2_plugin.priors.extras import opencv
 from d2_plugin.priors.geometry import check_depth_range, check_views, scaled_camera
 from d2_plugin.priors.stereo.filtering.filter import GeometricDepth, filter_depths
 from d2_plugin.priors.stereo.patchmatch import patchmatch
 from d2_plugin.priors.stereo.reuse import MARGIN, MatchMemory, widened
 from d2_plugin.priors.stereo.settings import StereoSettings
+from d2_plugin.recordings.images import opencv
 from d2_plugin.recordings.recording import Camera
 
 RawDepth = tuple[np.ndarray, np.ndarray]

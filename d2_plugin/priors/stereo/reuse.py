@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from d2_plugin.priors.extras import opencv
+from d2_plugin.recordings.images import opencv
 
 SMOOTHING = 3  # side of the box over which a change is averaged, pixels: noise cancels, moving things do not
 MEMORY_DTYPE = np.dtype([("gray", "u1"), ("depth", "<f4"), ("cost", "<f4")])

@@ -66,25 +66,11 @@ def render_color(scene: Scene, camera: Camera, seconds: float) -> np.ndarray:
 
 def render_depth(scene: Scene, camera: Camera, seconds: float) -> np.ndarray:
     """Exact planar z float32 [H, W] at the pixel centres."""
-    distance, _ = _first_hits(scene, camera, _directions(camera, (0.5, 0.5)), seconds)
+    distance, _ = first_hits(scene, camera, directions_of(camera, (0.5, 0.5)), seconds)
     return distance.reshape(camera.height, camera.width).astype(np.float32)
 
 
-def render_flow(scene: Scene, camera: Camera, seconds: float, later: float) -> np.ndarray:
-    """Exact scene flow float32 [H, W, 3]: how far in the world what each pixel shows goes from one time to another."""
-    directions = _directions(camera, (0.5, 0.5))
-    distance, owner = _first_hits(scene, camera, directions, seconds)
-    points = camera.centre[:, None] + distance * directions
-    flow = np.zeros_like(points)
-    for index, solid in enumerate(scene.solids):
-        rays = np.flatnonzero(owner == index)
-        (rotation, centre), (turned, moved) = solid.motion(seconds), solid.motion(later)
-        local = rotation.T @ (points[:, rays] - centre[:, None])
-        flow[:, rays] = turned @ local + moved[:, None] - points[:, rays]
-    return flow.T.reshape(camera.height, camera.width, 3).astype(np.float32)
-
-
-def _directions(camera: Camera, offset: tuple[float, float]) -> np.ndarray:
+def directions_of(camera: Camera, offset: tuple[float, float]) -> np.ndarray:
     """World directions [3, H * W] with camera z = 1 through the point `offset` of every pixel."""
     x = (np.arange(camera.width) + offset[0] - camera.K[0, 2]) / camera.K[0, 0]
     y = (np.arange(camera.height) + offset[1] - camera.K[1, 2]) / camera.K[1, 1]
@@ -92,7 +78,7 @@ def _directions(camera: Camera, offset: tuple[float, float]) -> np.ndarray:
     return (right * x + down * y[:, None] + forward).reshape(3, -1)
 
 
-def _first_hits(scene: Scene, camera: Camera, directions: np.ndarray, seconds: float) -> tuple[np.ndarray, np.ndarray]:
+def first_hits(scene: Scene, camera: Camera, directions: np.ndarray, seconds: float) -> tuple[np.ndarray, np.ndarray]:
     """(distance [R], index of the solid met first [R], -1 for the room)."""
     walls = np.where(directions > 0, scene.room.high[:, None], scene.room.low[:, None]) - camera.centre[:, None]
     with np.errstate(divide="ignore"):
@@ -148,8 +134,8 @@ def _sphere_distances(radius: float, origins: np.ndarray, directions: np.ndarray
 
 def _shaded(scene: Scene, camera: Camera, seconds: float, offset: tuple[float, float], light: np.ndarray) -> np.ndarray:
     """Colours [3, R] of one ray per pixel."""
-    directions = _directions(camera, offset)
-    distance, owner = _first_hits(scene, camera, directions, seconds)
+    directions = directions_of(camera, offset)
+    distance, owner = first_hits(scene, camera, directions, seconds)
     points = camera.centre[:, None] + distance * directions
     albedo, normals = np.empty_like(points), np.empty_like(points)
     for index in range(-1, len(scene.solids)):

@@ -22,7 +22,7 @@ from d2_plugin.errors import D2Error
 from d2_plugin.recordings.cameras.camera import pinhole, rigid
 from d2_plugin.recordings.recording import Camera, Recording, Source
 from d2_plugin.recordings.synthetic import materials
-from d2_plugin.recordings.synthetic.raycast import Motion, Room, Scene, Solid, render_color, render_depth, render_flow
+from d2_plugin.recordings.synthetic.raycast import Motion, Room, Scene, Solid, render_color, render_depth
 from d2_plugin.values import checked_arguments
 
 CACHE_BYTES = 64 * 2**20  # images kept after rendering them, oldest forgotten first
@@ -135,10 +135,6 @@ class SyntheticSource(Source):
 
     def depth(self, camera: str, frame: int) -> np.ndarray:
         return self._kept("depth", camera, frame, render_depth)
-
-    def flow(self, camera: str, frame: int, later: int) -> np.ndarray:
-        """True scene flow [H, W, 3] from a frame to another, world units."""
-        return render_flow(self.scene, self.cameras[camera], frame / self.fps, later / self.fps)
 
     def mono(self, camera: str, frame: int) -> np.ndarray:
         number = list(self.cameras).index(camera)

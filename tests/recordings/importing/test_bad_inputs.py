@@ -270,7 +270,7 @@ def test_a_video_that_moved_since_it_was_imported(given: Filmed, tmp_path: Path,
     words = ["import", str(given.videos), "--calibration", str(given.calibration), "--output", str(folder)]
     assert main([*words, "--exposure", "false", "--offsets", "none", "--images", "videos"]) == 0
     (given.videos / "03.mp4").rename(tmp_path / "elsewhere.mp4")
-    assert main(["doctor", str(folder)]) == 2
+    assert main(["plan", str(folder), "--train-cameras", "all"]) == 2
     assert "the video of camera 03 is not at" in capsys.readouterr().err
     short = select_frames(replace(open_recording(folder, cameras=["02"]), frames=(0, 1)), (0, 1))
     assert len(short.frames) == 2

@@ -16,7 +16,6 @@ from d2_plugin.durable import read_table
 from d2_plugin.recordings import Recording, open_recording, select_cameras
 from d2_plugin.recordings.cameras.camera import CalibratedCamera
 from d2_plugin.recordings.cameras.lens import Lens
-from d2_plugin.recordings.checks.lacking import lacking_text
 from d2_plugin.recordings.importing.importing import import_videos
 from d2_plugin.recordings.importing.settings import ImportSettings
 from d2_plugin.recordings.importing.source import Cut, VideosSource
@@ -156,18 +155,15 @@ def test_the_commands(filmed: Filmed, tmp_path: Path, capsys: pytest.CaptureFixt
     said = capsys.readouterr().out
     assert "start in frames, by sound: 01 +0.00, 02 -7.5" in said
     assert "4 cameras, 5 frames at 24 per second, 160x90 pixels" in said
-    assert main(["doctor", str(tmp_path / "c")]) == 0
+    assert main(["plan", str(tmp_path / "c"), "--train-cameras", "all"]) == 0
     said = capsys.readouterr().out
-    assert "lacks  mono" in said
-    assert "has  cameras     4, 19 to 20 degrees" in said
+    assert "leave out  monocular    no maps on disk and no network" in said
+    assert "4 training cameras, " in said
+    assert "degrees apart" in said
 
 
-def test_doctor_says_what_is_there_and_what_is_not(imported: Path, plaza: Recording) -> None:
+def test_the_exposures_that_were_measured_are_kept(imported: Path) -> None:
     recording = open_recording(imported)
     table = json.loads((imported / "cameras.json").read_text())
     assert set(table["exposures"]) == set(NAMES)
     assert recording.exposures["02"].gain == tuple(table["exposures"]["02"]["gain"])
-    said = lacking_text(recording)
-    assert "clock       cameras exposed up to 0.0" in said
-    assert "exposure    measured; 0" in said
-    assert "relative maps, emulated" in lacking_text(plaza)

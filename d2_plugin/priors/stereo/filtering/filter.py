@@ -13,11 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from d2_plugin.priors.extras import opencv
 from d2_plugin.priors.stereo.filtering import kernel
 from d2_plugin.priors.stereo.filtering.confirm import RELATIVE_DEPTH, confirm
 from d2_plugin.priors.stereo.filtering.precision import geometric_sigma, grey_gradient
 from d2_plugin.priors.stereo.settings import StereoSettings
+from d2_plugin.recordings.images import opencv
 from d2_plugin.recordings.recording import Camera
 
 COST_MAX = 0.5

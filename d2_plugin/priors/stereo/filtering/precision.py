@@ -19,8 +19,8 @@ from typing import Any
 
 import numpy as np
 
-from d2_plugin.priors.extras import opencv
 from d2_plugin.priors.stereo.filtering import kernel
+from d2_plugin.recordings.images import opencv
 
 MATCHING = 0.00293
 """Error of the best match, pixels: next to nothing; the gradient decides."""
