@@ -129,7 +129,7 @@ def _between(store: PriorStore, source: SyntheticSource, name: str, frame: int, 
 
 
 def scene_flow(source: SyntheticSource, name: str, frame: int, later: int) -> np.ndarray:
-    """Exact scene flow [H, W, 3]: how far in the world what each pixel shows goes from a frame to another."""
+    """Exact scene flow [H, W, 3] in world units: how far what each pixel shows goes from a frame to another."""
     camera, seconds, then = source.cameras[name], frame / source.fps, later / source.fps
     directions = directions_of(camera, (0.5, 0.5))
     distance, owner = first_hits(source.scene, camera, directions, seconds)

@@ -52,7 +52,8 @@ def run(settings: Doctor) -> str:
         return needs(recipe(settings.attach), settings.path)
     if settings.path is not None:
         raise D2Error(
-            f"--attach NAME is missing; of a recording, d2 plan {settings.path} --train-cameras all says more"
+            "a folder is looked at with --attach NAME, as the repository of that trainer; what a recording needs says "
+            f"d2 plan {settings.path} --train-cameras all"
         )
     return report()
 

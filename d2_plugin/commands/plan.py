@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from d2_plugin.commands.arguments.form import Form, Given
@@ -24,7 +25,7 @@ def run(given: Given) -> None:
 
     scene = Scene.open(check(run_settings(given)))
     show(f"recording  {described(scene.recording)}")
-    show_notes(scene.recording.notes)
+    show_notes((*scene.recording.notes, *_clock(scene.recording)))
     show_plan(scene.plan)
 
 
@@ -34,7 +35,17 @@ def described(recording: Recording) -> str:
     sizes = _each(f"{camera.width}x{camera.height}" for camera in recording.cameras.values())
     when = f"frames {frames[0]} to {frames[-1]} ({len(frames)})" if len(frames) > 1 else f"frame {frames[0]}"
     who = f"{len(cameras)} camera{'' if len(cameras) == 1 else 's'} ({', '.join(cameras)})"
-    return f"{recording.name}: layout {recording.layout}, {who}, {when} at {recording.fps:g} per second, {sizes} pixels"
+    when += f" at {recording.rate:g} per second"
+    return f"{recording.name}: layout {recording.layout}, {who}, {when}, {sizes} pixels"
+
+
+def _clock(recording: Recording) -> Iterable[str]:
+    """How far apart the cameras expose, or that nothing says whether they are synchronised."""
+    late = [abs(seconds) * recording.fps for times in recording.late.values() for seconds in times.values()]
+    if late:
+        yield f"cameras expose up to {max(late):.2f} frames apart; each image is trained at its own instant"
+    elif len(recording.frames) > 1 and not Path(recording.path or "", "import", "clocks.json").is_file():
+        yield "nothing says how the cameras were synchronised: equal frame numbers are taken as one instant"
 
 
 def _each(values: Iterable[str]) -> str:

@@ -254,7 +254,7 @@ class TestOnARecording:
 
     def test_a_dense_start_adds_stereo_points_to_the_triangulated_ones(self, ablation: Path) -> None:
         run = run_of(ablation, "dense_start")
-        points = run._points()
+        points = run.prepare()
         started = guidance("dense_start", 24).start(run.scene, points, run.priors)
         assert len(points) + 300 < len(started) <= len(points) + 0.18 * 96 * 54 + 6  # each of six images rounds
         np.testing.assert_array_equal(started.positions[: len(points)], points.positions)

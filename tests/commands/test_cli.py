@@ -166,6 +166,20 @@ def test_plan_names_each_decision_with_its_measurement(recording: Path, capsys: 
     assert "(emulated)" in lines[2]
 
 
+def test_plan_says_the_rate_of_the_chosen_frames_and_that_no_clock_is_known(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    room = save_recording(synthetic_recording(cameras=2, held_out=0, frames=5, width=96, height=54), tmp_path / "room")
+    assert main(["plan", str(room), "--train-cameras", "all", "--frames", "0:4:2"]) == 0
+    said = capsys.readouterr().out
+    assert "frames 0 to 4 (3) at 6 per second" in said
+    assert "nothing says how the cameras were synchronised" in said
+
+
+def test_the_doctor_of_a_recording_names_the_plan(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert f"d2 plan {recording}" in refused(capsys, main(["doctor", str(recording)]))
+
+
 def test_one_instant_leaves_the_temporal_dimension_out(recording: Path, tmp_path: Path) -> None:
     assert train(recording, tmp_path / "still", "--frames", "1:1", "--hooks", "none") == 0
     metrics = json.loads((tmp_path / "still" / "metrics.json").read_text())

@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 
@@ -207,6 +207,7 @@ def test_closed_streams_are_no_fault_and_no_file_takes_their_place(tmp_path: Pat
 
 INTERRUPTED = """
 import importlib.abc, signal
+signal.signal(signal.SIGINT, signal.default_int_handler)
 class Stops(importlib.abc.MetaPathFinder):
     def find_spec(self, name, path, target=None):
         if name == "d2_plugin.commands.arguments.form":
@@ -220,6 +221,15 @@ def test_ctrl_c_while_the_first_modules_are_imported_is_one_sentence() -> None:
     assert (ended.returncode, ended.stderr) == (130, "d2: stopped: continue with the same command\n")
 
 
+@pytest.fixture
+def in_a_terminal() -> Iterator[None]:
+    """Ctrl-C as a terminal has it: a shell's background job, and what nohup starts, begin with it ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("in_a_terminal")
 def test_an_error_that_a_library_makes_of_ctrl_c_is_ctrl_c(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

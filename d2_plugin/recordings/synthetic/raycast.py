@@ -79,7 +79,7 @@ def directions_of(camera: Camera, offset: tuple[float, float]) -> np.ndarray:
 
 
 def first_hits(scene: Scene, camera: Camera, directions: np.ndarray, seconds: float) -> tuple[np.ndarray, np.ndarray]:
-    """(distance [R], index of the solid met first [R], -1 for the room)."""
+    """(distance [R] in lengths of `directions` [3, R], index of the solid met first [R], -1 for the room)."""
     walls = np.where(directions > 0, scene.room.high[:, None], scene.room.low[:, None]) - camera.centre[:, None]
     with np.errstate(divide="ignore"):
         distance = np.where(directions == 0, np.inf, walls / directions).min(axis=0)

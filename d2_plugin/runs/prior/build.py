@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -24,22 +24,18 @@ def build_priors_for(
     *,
     shard: tuple[int, int] | None = None,
     cluster: Mapping[str, Any] | None = None,
-    on_image: Callable[[int], None] | None = None,
     between: bool = True,
 ) -> PriorSummary:
     """Build what is missing of the depth prior in `folder`; `points` [P, 3] bound the depths that are searched.
 
     `shard` (index from 0, count) builds one part, so that any scheduler can run the parts beside each other. `cluster`
-    (`scheduler` or `workers`) hands the frames to dask.distributed instead. `on_image` is called with the number of
-    images that are done: all cameras of one frame after the other, the frames in order. `between` makes the instants
-    between the frames as well, for the hook `motion`.
+    (`scheduler` or `workers`) hands the frames to dask.distributed instead. `between` makes the instants between the
+    frames as well, for the hook `motion`.
     """
     with progress_bar("priors", len(scene.recording.frames) * len(scene.train_cameras)) as bar:
 
         def report(done: int, total: int, note: str = "") -> None:
             bar.update(done, note)
-            if on_image is not None:
-                on_image(done)
 
         if cluster is None:
             build = partial(build_priors, shard=shard)

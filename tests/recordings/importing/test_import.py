@@ -160,6 +160,7 @@ def test_the_commands(filmed: Filmed, tmp_path: Path, capsys: pytest.CaptureFixt
     assert "leave out  monocular    no maps on disk and no network" in said
     assert "4 training cameras, " in said
     assert "degrees apart" in said
+    assert "cameras expose up to 0." in said
 
 
 def test_the_exposures_that_were_measured_are_kept(imported: Path) -> None:
