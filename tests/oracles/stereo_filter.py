@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from d2_plugin.priors.geometry import Projection, ViewPair, view_pair, viewing_rays
-from d2_plugin.priors.stereo.filtering.confirm import NUDGE, RELATIVE_DEPTH, REPROJECTION_MAX
+from d2_plugin.priors.stereo.filtering.confirm import NUDGE, REPROJECTION_MAX
 from d2_plugin.priors.stereo.filtering.precision import (
     FLATTEST,
     FLOOR,
@@ -79,6 +79,7 @@ def add_source(
     reference: Camera,
     source: Camera,
     settings: StereoSettings,
+    tolerance: float,
 ) -> None:
     """Add what one source says of `depth` [H, W] to the sums: the bits of the kernel.
 
@@ -96,7 +97,7 @@ def add_source(
     back = way_back.project(forth.x, forth.y, seen)
     off_x, off_y = back.x - u, back.y - v
     near = np.sqrt(off_x * off_x + off_y * off_y) < np.float32(REPROJECTION_MAX)
-    near &= np.abs(back.z - depth) < np.float32(RELATIVE_DEPTH) * depth
+    near &= np.abs(back.z - depth) < np.float32(tolerance) * depth
     near &= _meet(rays, depth, pair, settings)
     nudged = pair.project(u[near].astype(np.float64), v[near].astype(np.float64), depth[near] * np.exp(NUDGE))
     moved_x, moved_y = nudged.x - forth.x[near], nudged.y - forth.y[near]

@@ -58,6 +58,24 @@ def test_half_resolution_comes_back_at_full_size(pair: Recording) -> None:
     assert wrong < 0.03
 
 
+def test_half_the_size_fills_what_the_full_size_leaves_empty(pair: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
+    both = run(pair, (2.0, 9.0))
+    monkeypatch.setattr("d2_plugin.priors.stereo.geometric_depth.SCALES", (1,))
+    full = run(pair, (2.0, 9.0))
+    for camera, one, alone in zip(pair.cameras, both, full):
+        known = alone.depth > 0
+        np.testing.assert_array_equal(one.depth[known], alone.depth[known])
+        filled = (one.depth > 0) & ~known
+        assert filled.sum() > 0.02 * known.sum()
+        assert one.record["survivors"]["filled"] == np.count_nonzero(one.depth)
+        truth = pair.depth(camera, 0)
+        assert truth is not None
+        errors = np.abs(one.depth[filled] / truth[filled] - 1)
+        assert np.median(errors) < 0.01
+        assert (errors < 2 * one.sigma[filled]).mean() > 0.75
+        assert np.median(one.sigma[filled]) > np.median(one.sigma[known])
+
+
 def geometric(depth: np.ndarray) -> GeometricDepth:
     """One view's depth with a sigma of one per cent."""
     sigma = np.where(depth > 0, 0.01, np.inf).astype(np.float32)

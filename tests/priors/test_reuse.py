@@ -55,11 +55,11 @@ def test_a_change_is_what_outlasts_noise_and_its_neighbourhood_changes_with_it()
 
 def test_a_scene_that_stands_still_is_matched_once() -> None:
     still = synthetic_recording(cameras=2, held_out=0, frames=2, width=128, height=72, arc_degrees=10, moving=False)
-    memory, results = MatchMemory(), []
+    memories, results = [MatchMemory(), MatchMemory()], []
     for frame in still.frames:
         images = [still.image(name, frame) for name in NAMES]
-        results.append(geometric_depth(images, list(still.cameras.values()), (2, 9), STEREO, memory=memory))
-    assert memory.matched_share == 0
+        results.append(geometric_depth(images, list(still.cameras.values()), (2, 9), STEREO, memories=memories))
+    assert [memory.matched_share for memory in memories] == [0, 0]
     np.testing.assert_array_equal(results[0][0].depth, results[1][0].depth)
 
 

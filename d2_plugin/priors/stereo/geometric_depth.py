@@ -1,15 +1,20 @@
-"""Geometric depth of one timestamp: choose a matcher, match at the chosen size, filter, bring back to full size."""
+"""Geometric depth of one timestamp: choose a matcher, match at two sizes, filter each, bring back to full size.
+
+A wall with little texture says nothing in a window of eleven pixels, and more at half the size. What is left empty at
+the chosen size is filled with what passes the same filter at half of it, and is declared less exact."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from itertools import repeat
 
 import numpy as np
 
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.priors.geometry import check_depth_range, check_views, scaled_camera
+from d2_plugin.priors.stereo.filtering.confirm import RELATIVE_DEPTH
 from d2_plugin.priors.stereo.filtering.filter import GeometricDepth, filter_depths
 from d2_plugin.priors.stereo.patchmatch import patchmatch
 from d2_plugin.priors.stereo.reuse import MARGIN, MatchMemory, widened
@@ -28,6 +33,10 @@ Matcher = Callable[..., list[RawDepth]]
 
 LUMA = np.array([0.299, 0.587, 0.114], np.float32)  # ITU-R BT.601, as every codec of the recordings uses
 
+SCALES = (1, 2)
+"""Images are matched at this many times fewer pixels each way in turn; a later one fills what the earlier leave empty.
+At a quarter of the size edges fatten."""
+
 MATCHERS: dict[str, Matcher] = {"patchmatch": patchmatch}
 """Matchers by their name in the settings."""
 
@@ -41,7 +50,7 @@ def geometric_depth(
     depth_range: tuple[float, float],
     settings: StereoSettings,
     matcher: str | None = None,
-    memory: MatchMemory | None = None,
+    memories: Sequence[MatchMemory] | None = None,
 ) -> list[GeometricDepth]:
     """D^g of every view from the synchronized views of one timestamp, and of no other.
 
@@ -51,8 +60,8 @@ def geometric_depth(
         depth_range: near and far in world units; ten times too wide does no harm.
         settings: matching and filtering.
         matcher: name in `MATCHERS` or `auto`; settings.matcher where None.
-        memory: matches of the frames before, which are carried over where the images did not change, and which this
-            frame's are added to.
+        memories: by scale, matches of the frames before, which are carried over where the images did not change, and
+            which this frame's are added to.
 
     Returns:
         Per camera the filtered depth; empty everywhere where nothing can be known (no texture, one centre).
@@ -64,15 +73,47 @@ def geometric_depth(
     check_views(images, cameras)
     depth_range = check_depth_range(depth_range)
     match = MATCHERS[choose_matcher(matcher or settings.matcher)]
-    small = [_shrunk(gray(image), camera, settings.max_pixels) for image, camera in zip(images, cameras)]
-    grays, small_cameras = [pair[0] for pair in small], [pair[1] for pair in small]
+    grays = [gray(image) for image in images]
+    by_scale = []
+    for scale, memory in zip(SCALES, memories or repeat(None)):
+        small = [_shrunk(*view, settings.max_pixels, scale) for view in zip(grays, cameras)]
+        filtered = _matched(
+            [pair[0] for pair in small], [pair[1] for pair in small], match, depth_range, settings, memory, scale
+        )
+        tolerance = RELATIVE_DEPTH * scale
+        by_scale.append(
+            [enlarged(one, camera.width, camera.height, tolerance) for one, camera in zip(filtered, cameras)]
+        )
+    return [_filled(results) for results in zip(*by_scale)]
+
+
+def _matched(
+    grays: Sequence[np.ndarray],
+    cameras: Sequence[Camera],
+    match: Matcher,
+    depth_range: tuple[float, float],
+    settings: StereoSettings,
+    memory: MatchMemory | None,
+    scale: int,
+) -> list[GeometricDepth]:
+    """Filtered depth at one size; what did not change since the frame before is not matched again."""
     wanted = None if memory is None else memory.wanted(grays)
     matched = None if wanted is None else [widened(mask, MARGIN) for mask in wanted]
-    raw = match(grays, small_cameras, depth_range, settings, matched)
+    raw = match(grays, cameras, depth_range, settings, matched)
     if memory is not None:
         raw = memory.merge(grays, raw, wanted)
-    filtered = filter_depths(grays, small_cameras, [depth for depth, _ in raw], [cost for _, cost in raw], settings)
-    return [enlarged(result, camera.width, camera.height) for result, camera in zip(filtered, cameras)]
+    depths, costs = zip(*raw)
+    return filter_depths(grays, cameras, depths, costs, settings, RELATIVE_DEPTH * scale)
+
+
+def _filled(results: Sequence[GeometricDepth]) -> GeometricDepth:
+    """The first of several results of one view, with what the later ones know where it is empty."""
+    depth, sigma = results[0].depth.copy(), results[0].sigma.copy()
+    for coarser in results[1:]:
+        empty = depth == 0
+        depth[empty], sigma[empty] = coarser.depth[empty], coarser.sigma[empty]
+    survivors = results[0].record["survivors"] | {"filled": int(np.count_nonzero(depth))}
+    return GeometricDepth(depth, sigma, {"survivors": survivors})
 
 
 def choose_matcher(name: str) -> str:
@@ -93,9 +134,10 @@ def gray(image: np.ndarray) -> np.ndarray:
     return np.rint(image.astype(np.float32) @ LUMA).astype(np.uint8)
 
 
-def _shrunk(gray: np.ndarray, camera: Camera, max_pixels: int) -> tuple[np.ndarray, Camera]:
-    """Image and camera at the largest of full, half, a third, ... of the size that has at most `max_pixels`."""
-    divisor = math.ceil(math.sqrt(gray.size / max(max_pixels, 1)))
+def _shrunk(gray: np.ndarray, camera: Camera, max_pixels: int, scale: int) -> tuple[np.ndarray, Camera]:
+    """Image and camera at the largest of full, half, a third, ... of the size that has at most `max_pixels`, and
+    `scale` times smaller."""
+    divisor = scale * math.ceil(math.sqrt(gray.size / max(max_pixels, 1)))
     if divisor <= 1:
         return gray, camera
     cv2 = opencv("matching at another resolution")
@@ -104,7 +146,7 @@ def _shrunk(gray: np.ndarray, camera: Camera, max_pixels: int) -> tuple[np.ndarr
     return small, scaled_camera(camera, width, height)
 
 
-def enlarged(result: GeometricDepth, width: int, height: int, tolerance: float = 0.01) -> GeometricDepth:
+def enlarged(result: GeometricDepth, width: int, height: int, tolerance: float = RELATIVE_DEPTH) -> GeometricDepth:
     """The maps at another size: inverse depth, which is linear over a plane, is interpolated between four neighbours.
 
     Where they differ by more than twice `tolerance`, or one is missing, nothing is known: an interpolated value would

@@ -15,7 +15,7 @@ from d2_plugin.priors.frame import Frame
 from d2_plugin.priors.geometric_source import GeometricSource
 from d2_plugin.priors.stereo.depth_range import DepthBounds
 from d2_plugin.priors.stereo.filtering.filter import GeometricDepth
-from d2_plugin.priors.stereo.geometric_depth import choose_matcher, geometric_depth
+from d2_plugin.priors.stereo.geometric_depth import SCALES, choose_matcher, geometric_depth
 from d2_plugin.priors.stereo.reuse import MatchMemory
 from d2_plugin.priors.stereo.settings import StereoSettings
 from d2_plugin.recordings.recording import Camera
@@ -46,7 +46,7 @@ class MatchedDepth(GeometricSource):
         self.depth_range = bounds[:2]
         self.read = read
         self._before = {after: before for block in frame_blocks(frames, settings) for before, after in pairwise(block)}
-        self._memory, self._remembered = MatchMemory(), ""
+        self._memories, self._remembered = _memories(), ""
 
     def _inputs(self, frame: Frame) -> str:
         """The key of the frame whose matches are carried over."""
@@ -61,15 +61,19 @@ class MatchedDepth(GeometricSource):
         """D^g per camera at one frame. A build that goes on within a block matches the frames before it again."""
         key, before = self.key(frame), self._before.get(frame.number)
         if before is None:
-            self._memory = MatchMemory()
+            self._memories = _memories()
         elif self._remembered != self._keys[before]:
             self._computed(self.read(before))
         images = [frame.images[camera.name] for camera in self.cameras]
-        memory = self._memory if self.settings.reuse_static else None
-        results = geometric_depth(images, self.cameras, self.depth_range, self.settings, self.matcher, memory)
+        memories = self._memories if self.settings.reuse_static else None
+        results = geometric_depth(images, self.cameras, self.depth_range, self.settings, self.matcher, memories)
         self._remembered = key
-        matched_share = 1.0 if memory is None else round(memory.matched_share, 6)
+        matched_share = 1.0 if memories is None else round(memories[0].matched_share, 6)
         return [replace(result, record=result.record | {"matched_share": matched_share}) for result in results]
+
+
+def _memories() -> list[MatchMemory]:
+    return [MatchMemory() for _ in SCALES]
 
 
 def frame_blocks(frames: Sequence[int], settings: StereoSettings) -> list[tuple[int, ...]]:

@@ -32,19 +32,24 @@ class Confirmation(NamedTuple):
 
 
 def confirm(
-    index: int, cameras: Sequence[Camera], depths: Sequence[np.ndarray], settings: StereoSettings
+    index: int,
+    cameras: Sequence[Camera],
+    depths: Sequence[np.ndarray],
+    settings: StereoSettings,
+    tolerance: float = RELATIVE_DEPTH,
 ) -> Confirmation:
     """Compare the depths of view `index` with those of every other view.
 
     A source confirms when its own depth, read where ours lands, takes us back to within `REPROJECTION_MAX` pixels
-    (COLMAP's geometric consistency), agrees to `RELATIVE_DEPTH` in our view, and the two rays meet at an angle between
+    (COLMAP's geometric consistency), agrees to `tolerance` in our view, and the two rays meet at an angle between
     `min_angle` and `max_angle`.
     """
     reference, depth = cameras[index], np.ascontiguousarray(depths[index], np.float32)
     sums = _Sums(np.zeros(depth.shape, np.uint8), np.zeros(depth.shape), np.zeros(depth.shape))
     for other, source in enumerate(cameras):
         if other != index:
-            _add_source(sums, depth, np.ascontiguousarray(depths[other], np.float32), reference, source, settings)
+            theirs = np.ascontiguousarray(depths[other], np.float32)
+            _add_source(sums, depth, theirs, reference, source, settings, tolerance)
     spread = np.sqrt(sums.difference / (sums.information + (sums.information == 0)))
     return Confirmation(sums.confirming, np.sqrt(sums.information), spread)
 
@@ -67,6 +72,7 @@ def _add_source(
     reference: Camera,
     source: Camera,
     settings: StereoSettings,
+    tolerance: float,
 ) -> None:
     """Add the confirmation of `depth` [H, W] by one source to the sums."""
     rays = np.linalg.inv(index_intrinsics(reference))
@@ -78,7 +84,7 @@ def _add_source(
         "between": settings.between_pixels,
         "continuous": CONTINUOUS,
         "reprojection_max": REPROJECTION_MAX,
-        "relative_depth_max": RELATIVE_DEPTH,
+        "relative_depth_max": tolerance,
         "sine_min": np.sin(low),
         "cosine_min": np.cos(low),
         "sine_max": np.sin(high),

@@ -62,6 +62,7 @@ def filter_depths(
     depths: Sequence[np.ndarray],
     costs: Sequence[np.ndarray],
     settings: StereoSettings,
+    tolerance: float = RELATIVE_DEPTH,
 ) -> list[GeometricDepth]:
     """Apply all tests to the raw maps of one timestamp.
 
@@ -71,6 +72,7 @@ def filter_depths(
         depths: raw planar depth float32 [H, W] per camera, 0 or NaN where the matcher has none.
         costs: matching cost 1 - NCC float32 [H, W] per camera.
         settings: thresholds.
+        tolerance: depths of one surface differ by less than this share.
 
     Returns:
         One `GeometricDepth` per camera. Nothing survives where no source can confirm it.
@@ -80,14 +82,14 @@ def filter_depths(
     matched = [depth * (cost < COST_MAX) for depth, cost in zip(known, costs)]
     textured = [depth * texture_mask(gray) for gray, depth in zip(grays, matched)]
     # Neighbours in the unfiltered map: one that matched badly may still tell where the surface runs.
-    coherent = [surface_coherence(gray, depth) for gray, depth in zip(grays, known)]
+    coherent = [surface_coherence(gray, depth, tolerance) for gray, depth in zip(grays, known)]
     candidates = [z * (share >= COHERENCE_MIN) for share, z in zip(coherent, textured)]
     results = []
     for index, gray in enumerate(grays):
-        confirmation = confirm(index, cameras, candidates, settings)
+        confirmation = confirm(index, cameras, candidates, settings, tolerance)
         needed = min(settings.min_sources, len(cameras) - 1)
         confirmed = candidates[index] * (confirmation.sources >= max(needed, 1))
-        final = remove_speckles(confirmed)
+        final = remove_speckles(confirmed, tolerance)
         survivors = {
             "pixels": gray.size,
             "matched": int(np.count_nonzero(matched[index] > 0)),
@@ -119,18 +121,19 @@ def texture_mask(gray: np.ndarray) -> np.ndarray:
     return np.sqrt(np.maximum(square - mean * mean, 0)) > TEXTURE_MIN
 
 
-def surface_coherence(gray: np.ndarray, depth: np.ndarray) -> np.ndarray:
+def surface_coherence(gray: np.ndarray, depth: np.ndarray, tolerance: float = RELATIVE_DEPTH) -> np.ndarray:
     """Share of a pixel's neighbours that lie on its tangent plane, weighted by similarity of grey value.
 
     A wrong match is seldom wrong in the same way as its neighbours, while a right one shares a tangent plane with them.
     The test needs nothing but the depth map, so it judges every matcher alike. A plane in space is linear in inverse
     depth over the image, so the tangent is the gradient of inverse depth, taken as a median of 5x5 that a few wrong
-    neighbours cannot turn. A neighbour agrees within `RELATIVE_DEPTH` of inverse depth; those without depth count as
+    neighbours cannot turn. A neighbour agrees within `tolerance` of inverse depth; those without depth count as
     disagreeing.
 
     Args:
         gray: uint8 [H, W].
         depth: planar z float32 [H, W], 0 where there is none.
+        tolerance: share of the inverse depth.
 
     Returns:
         float32 [H, W] in 0..1; 0 where there is no depth.
@@ -139,11 +142,11 @@ def surface_coherence(gray: np.ndarray, depth: np.ndarray) -> np.ndarray:
     inverse, across, down = kernel.slopes(np.ascontiguousarray(depth, np.float32), SLOPE_REACH)
     slopes = cv2.medianBlur(across, 5), cv2.medianBlur(down, 5)
     weights = np.append(np.exp(-0.5 * (np.arange(256) / 255 / CONTRAST) ** 2), 0).astype(np.float32)
-    return kernel.coherence(np.ascontiguousarray(gray), inverse, slopes, weights, REACH, STRIDE, RELATIVE_DEPTH)
+    return kernel.coherence(np.ascontiguousarray(gray), inverse, slopes, weights, REACH, STRIDE, tolerance)
 
 
-def remove_speckles(depth: np.ndarray) -> np.ndarray:
-    """Drop connected pieces of fewer than `SPECKLE_SIZE` pixels; neighbours belong together below 2 `RELATIVE_DEPTH`.
+def remove_speckles(depth: np.ndarray, tolerance: float = RELATIVE_DEPTH) -> np.ndarray:
+    """Drop connected pieces of fewer than `SPECKLE_SIZE` pixels; neighbours belong together below 2 `tolerance`.
 
     Works on log-depth in steps, because depth itself has no common scale across a scene.
     """
@@ -152,7 +155,7 @@ def remove_speckles(depth: np.ndarray) -> np.ndarray:
     cv2 = opencv("the filter of geometric depth")
     valid = depth > 0
     logs = np.log(np.fmax(depth, 0) * valid + ~valid, dtype=np.float32)
-    scaled = (logs - (logs + NEVER * ~valid).min()) / RELATIVE_DEPTH * 4
+    scaled = (logs - (logs + NEVER * ~valid).min()) / tolerance * 4
     steps = ((np.clip(scaled, 0, 32000) + 1) * valid).astype(np.int16)
     cv2.filterSpeckles(steps, 0, SPECKLE_SIZE, 8)
     return np.where(steps > 0, depth, 0).astype(np.float32)
