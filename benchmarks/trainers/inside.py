@@ -1,10 +1,11 @@
 """The process of one official trainer: the launcher's work, and afterwards what cannot be asked from outside.
 
-    python -m benchmarks.trainers.inside OUTCOME SEED [HELD_OUT] -- fudan --cpu --d2 d2.toml -- train.py ...
+    python -m benchmarks.trainers.inside OUTCOME SEED TRUTH [HELD_OUT] -- fudan --cpu --d2 d2.toml -- train.py ...
 
 adds SEED to every seed that the script sets, and writes how many Gaussians there are and a digest of all trained
 numbers to OUTCOME (JSON), so that two runs can be told to be the same to the last bit. Two repositories print no report
-of held-out cameras; for them it prints one line, of images that their own code reads, draws and compares.
+of held-out cameras; for them it prints one line, of images that their own code reads, draws and compares. Of the images
+that a repository's own metric compares, what moves is scored as well, see `benchmarks.trainers.moving`.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from benchmarks.trainers.moving import Moving
 from d2_plugin.reading import json_text
 
 
@@ -33,11 +35,13 @@ def main(words: list[str]) -> int:
 
     logging.basicConfig(level=logging.INFO, format="d2: %(message)s")
     at = words.index("--")
-    outcome_file, seed, *held_out = words[:at]
+    outcome_file, seed, truth, *held_out = words[:at]
     options, command = parsed(words[at + 1 :])
     move_seeds(int(seed))
     try:
         session = prepare(options, command)
+        moving = Moving(Path(truth))
+        moving.watch(options.repository)
         start = time.process_time()
         runpy.run_path(command[0], run_name="__main__")
         seconds = time.process_time() - start
@@ -51,11 +55,12 @@ def main(words: list[str]) -> int:
         session.end()
         log = session.hooks.log
         outcome |= {"inserted": log.inserted, "removed": log.removed}
-    Path(outcome_file).write_text(json_text(outcome, outcome_file), encoding="utf-8")
     if options.repository in SCORERS:
         psnr = SCORERS[options.repository](objects, *map(Path, held_out))
         assert sys.__stdout__ is not None  # the trainers' safe_state puts another sys.stdout into its place
         sys.__stdout__.write(f"\n[held out] iteration {objects.options.iterations}: PSNR {psnr}\n")
+    outcome["psnr_moving"] = moving.score()
+    Path(outcome_file).write_text(json_text(outcome, outcome_file), encoding="utf-8")
     return 0
 
 

@@ -20,6 +20,7 @@ HEADER = (
     "no hooks",
     "attached",
     "gain",
+    "of what moves",
     "Gaussians",
     "D2 +/-",
     "worst",
@@ -62,10 +63,24 @@ def _line(case: tuple, rows: list[Row]) -> tuple[str, ...]:
     return (
         *(str(case[0]), str(case[1]), str(case[4])),
         *(_spread([last(row) for row in bare]), same(bare, without), _spread([last(row) for row in attached])),
-        *(_spread(gains, sign="+"), " → ".join(_mean(some, "gaussians") for some in (bare, attached))),
+        *(_spread(gains, sign="+"), _moving(bare, attached)),
+        " → ".join(_mean(some, "gaussians") for some in (bare, attached)),
         " / ".join(_mean(attached, name) for name in ("inserted", "removed")),
         worst(bare, attached),
     )
+
+
+def _moving(bare: Sequence[Row], attached: Sequence[Row]) -> str:
+    """PSNR of what moves, bare and attached, and the gain; rows from before it was scored have none."""
+    both = [
+        (row["psnr_moving"], other["psnr_moving"])
+        for row, other in pairs(bare, attached)
+        if row.get("psnr_moving") is not None and other.get("psnr_moving") is not None
+    ]
+    if not both:
+        return "-"
+    ends = " → ".join(f"{mean(values):.2f}" for values in zip(*both))
+    return f"{ends}, {_spread([other - one for one, other in both], sign='+')}"
 
 
 def _mean(rows: Sequence[Row], name: str) -> str:

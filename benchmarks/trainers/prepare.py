@@ -8,6 +8,7 @@ import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from benchmarks.trainers.moving import save_truth
 from benchmarks.trainers.trials import HELD_OUT, TRAINED, Trial
 from d2_plugin.commands.export_recording import RecordingExport
 from d2_plugin.commands.export_recording import run as export
@@ -48,6 +49,8 @@ class Prepared:
     held_out: Path | None
     """A second export, of the cameras that are not trained on, for a repository that has no other way to test."""
     prior: Path
+    truth: Path
+    """What `moving.save_truth` wrote."""
 
 
 def prepare(source: Source, trial: Trial, work: Path) -> Prepared:
@@ -58,7 +61,10 @@ def prepare(source: Source, trial: Trial, work: Path) -> Prepared:
     held_out = None
     if trial.also_held_out:
         held_out = _exported(source, trial, work / "exports" / f"{named}-held-out", HELD_OUT, ())
-    return Prepared(source, data, held_out, _prior(source, work / "priors" / source.name))
+    truth = work / f"{source.name}.npz"
+    if not truth.is_file():
+        save_truth(source.recording, range(source.frames), source.downscale, truth)
+    return Prepared(source, data, held_out, _prior(source, work / "priors" / source.name), truth.resolve())
 
 
 def fitting_downscale(recording: Path, trial: Trial, downscale: int) -> int:

@@ -49,7 +49,7 @@ def trial_row(
 
 
 def _words(name: str, trial: Trial, job: Job, prepared: Prepared, method: str, seed: int) -> list[str]:
-    words = ["-m", "benchmarks.trainers.inside", str(job.output / "outcome.json"), str(seed)]
+    words = ["-m", "benchmarks.trainers.inside", str(job.output / "outcome.json"), str(seed), str(prepared.truth)]
     words += [str(prepared.held_out)] if prepared.held_out is not None else []
     words += ["--", name, *(() if _has_gpu() else ("--cpu",))]
     if method in CONFIGURATIONS:

@@ -17,7 +17,7 @@ from d2_plugin import registry
 from d2_plugin.config import D2Config
 from d2_plugin.errors import D2Error
 from d2_plugin.hooks.prior import Store
-from d2_plugin.hooks.reports import Report
+from d2_plugin.hooks.reports import RunLog
 from d2_plugin.plugin import D2Hooks
 from d2_plugin.protocol import Backbone
 
@@ -134,9 +134,8 @@ class Session:
         self.recipe, self.config, self.store, self.exported = recipe, config, store, exported
         self.objects = Objects()
         self.hooks: D2Hooks | None = None
-        self._iteration, self._counted = 0, False
-        self._drawn, self._batch = 0, 0
-        self._inserted, self._others, self._growth_logged = 0, 0, False
+        self._iteration, self._counted, self._drawn, self._batch = 0, False, 0, 0
+        self._growth_logged = False
 
     def wrap(self) -> None:
         """Override the choke points of the repository's modules; call before its script runs.
@@ -190,7 +189,6 @@ class Session:
         backbone, config = self.recipe.backbone(self.objects), self._configured(iterations)
         self.hooks = D2Hooks.from_config(config, backbone, self.store, iterations=iterations)
         self._iteration, self._counted, self._drawn, self._batch = 0, False, 0, 0
-        self._inserted, self._others = 0, len(self.hooks.backbone)
 
     def _configured(self, iterations: int | None) -> D2Config:
         assert self.config is not None
@@ -209,8 +207,8 @@ class Session:
 
     def _source(self) -> str | None:
         """The folder that the trainer reads."""
-        arguments, _ = self.objects.given.get("scene", ((), {}))
-        return getattr(arguments[0], "source_path", None) if arguments else None
+        arguments, _ = self.objects.given.get("scene", ((None,), {}))
+        return getattr(next(iter(arguments), None), "source_path", None)
 
     def _counting(self, update_learning_rate: Callable[..., Any]) -> Callable[..., Any]:
         @wraps(update_learning_rate)
@@ -273,20 +271,17 @@ class Session:
     def _after_step(self) -> None:
         if self.hooks is None:
             return
-        self._note_growth(self.hooks.step(self._iteration))
+        self.hooks.step(self._iteration)
+        self._note_growth(self.hooks.log)
         self._counted, self._drawn, self._batch = False, 0, self._drawn
 
-    def _note_growth(self, report: Report) -> None:
+    def _note_growth(self, done: RunLog) -> None:
         """Log once that the trainer's own densification outgrows what D2 inserted; it splits inserted ones as well."""
-        self._inserted, self._others = self._inserted + report.inserted, self._others - report.removed
-        own = report.gaussians - self._inserted - self._others
-        if self._inserted and own > MUCH_GROWTH * self._inserted and not self._growth_logged:
+        if 0 < done.inserted * MUCH_GROWTH < done.others and not self._growth_logged:
             self._growth_logged = True
-            log.warning(
-                "iteration %d: the trainer's own densification has made %d Gaussians beside the %d that D2 inserted: "
-                "end it earlier or raise its threshold if that is too many",
-                report.step, own, self._inserted,
-            )  # fmt: skip
+            made = f"made {done.others} Gaussians beside the {done.inserted} that D2 inserted"
+            sentence = "iteration %d: the trainer's own densification has %s: end it earlier or raise its threshold"
+            log.warning(sentence, done.last_step, made)
 
 
 def attribute_of(module: str, attribute: str) -> Any:

@@ -60,7 +60,7 @@ class RunLog:
 
     def __init__(self, hooks: Mapping[str, Hook]) -> None:
         self.hooks = hooks
-        self.inserted = self.removed = self.gaussians = self.last_step = 0
+        self.inserted = self.removed = self.gaussians = self.last_step = self._at_first = 0
         self._started, self._ended = False, False
         self._on_report: OnReport | None = None
         self._writer: ScalarWriter | None = None
@@ -86,7 +86,7 @@ class RunLog:
             on_report: called with the `Report` of every step.
             writer: gets the counts of every change and the mean of every loss.
         """
-        self._started, self._on_report, self._writer = True, on_report, writer
+        self._started, self._on_report, self._writer, self._at_first = True, on_report, writer, len(backbone)
         add_default_handler()
         if not self.hooks:
             log.info("attached without a hook: the trainer runs as without D2")
@@ -122,12 +122,17 @@ class RunLog:
         if (report.inserted or report.removed) and time.monotonic() - self._logged_at >= PAUSE:
             self._log_progress(report)
 
+    @property
+    def others(self) -> int:
+        """How many Gaussians the trainer's own densification has added, less those that it removed."""
+        return self.gaussians - self._at_first - self.inserted + self.removed
+
     def summary(self) -> str:
         """What D2 did, in one line."""
-        hooks = ", ".join(self.hooks) or "no hook"
-        line = f"{hooks}: {self.inserted} inserted, {self.removed} removed, {self.gaussians} Gaussians"
+        changes = f"{self.inserted} inserted, {self.removed} removed, {self.others:+d} by the trainer itself"
         losses = [f"{name} {mean.first:.3g} at first, {mean.now():.3g} at last" for name, mean in self._terms.items()]
-        return "; ".join([f"{line} after step {self.last_step}", *losses])
+        after = f"{self.gaussians} Gaussians after step {self.last_step}"
+        return "; ".join([f"{', '.join(self.hooks) or 'no hook'}: {changes}, {after}", *losses])
 
     def end(self) -> None:
         """Log the summary, once; called when the process ends."""

@@ -102,7 +102,7 @@ class TestAdapter:
         for action in data.draw(st.lists(st.sampled_from([*edits]), max_size=8)):
             numbers = torch.arange(float(len(adapter)))
             parts = standing.tables()
-            for part, values in zip(parts, numbers.split([len(part) for part in parts]), strict=True):
+            for part, values in zip(parts, numbers.split([len(part) for part in parts])):
                 part.copy_(values)
             reports.clear()
             edits[action]()

@@ -26,7 +26,7 @@ from d2_plugin.attach.packages import provide
 from d2_plugin.attach.recipes import RECIPES, recipe
 from d2_plugin.attach.session import AddGradient, Original, Session
 from d2_plugin.config import DensifyConfig, DepthLossConfig, PruneConfig
-from d2_plugin.hooks.reports import Report
+from d2_plugin.hooks.reports import Report, RunLog
 from d2_plugin.store.exported import RenamedStore
 
 DEPTH_LOSS = D2Config(depth_loss=DepthLossConfig(start=2))
@@ -111,12 +111,15 @@ class TestSession:
 
     def test_growth_beyond_what_was_inserted_is_logged_once(self, caplog: pytest.LogCaptureFixture) -> None:
         session = Session(recipe("fudan"), EDITS, TinyStore())
-        session._others = 100  # Gaussians when D2 was attached
-        session._note_growth(Report(inserted=10, removed=0, gaussians=130, step=1))
-        session._note_growth(Report(inserted=0, removed=20, gaussians=120, step=2))
+        done = RunLog({})
+        done._at_first = 100  # Gaussians when D2 was attached
+        for report in (Report(inserted=10, removed=0, gaussians=130, step=1), Report(0, 20, 120, 2)):
+            done.record_step(report)
+            session._note_growth(done)
         assert not caplog.records
         for step in (3, 4):
-            session._note_growth(Report(inserted=0, removed=0, gaussians=121, step=step))
+            done.record_step(Report(0, 0, 121, step))
+            session._note_growth(done)
         assert (
             caplog.text.count("iteration 3: the trainer's own densification has made 31 Gaussians beside the 10") == 1
         )

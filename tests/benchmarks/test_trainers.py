@@ -17,6 +17,7 @@ from mimics.workplace import furnish
 
 from benchmarks.trainers import inside, prepare
 from benchmarks.trainers.bench import TrainersBench, run
+from benchmarks.trainers.moving import Moving
 from benchmarks.trainers.page import read_rows, replaced, table
 from benchmarks.trainers.prepare import Prepared, Source
 from benchmarks.trainers.trials import TRIALS, Job, Trial, gsplat_stats, reported, scored_after
@@ -55,7 +56,7 @@ class TestTable:
         line = table(ROWS).splitlines()[-1]
         cells = [cell.strip() for cell in line.strip("|").split("|")]
         assert cells[:3] == ["fudan", "studio", "200"]
-        assert cells[3:] == ["21.00", "the same bits", "24.00", "+3.00", "1000 → 1500", "600 / 100", "-0.50 at 50"]
+        assert cells[3:] == ["21.00", "the same bits", "24.00", "+3.00", "-", "1000 → 1500", "600 / 100", "-0.50 at 50"]
 
     def test_one_other_bit_without_hooks_is_seen(self) -> None:
         assert "DIFFERS" in table([ROWS[0], ROWS[1] | {"digest": "c"}, ROWS[2]])
@@ -67,6 +68,16 @@ class TestTable:
         assert "21.50 ± 0.50" in text
         assert "+3.50 ± 0.50" in text
 
+    def test_what_moves_is_compared_where_both_were_scored(self) -> None:
+        bare, attached = row("bare", {"200": 21.0}, psnr_moving=18.0), row("attached", {"200": 24.0}, psnr_moving=20.5)
+        assert "| 18.00 → 20.50, +2.50 |" in table([bare, attached])
+        assert "18.00" not in table([bare, ROWS[2]])
+
+    def test_the_rows_of_the_page_are_read_and_its_tables_made_of_them(self) -> None:
+        page = TESTS.parent / "docs" / "results" / "attach.md"
+        text = page.read_text()
+        assert replaced(text, table(read_rows(page.with_suffix("") / "rows.jsonl")), "") == text
+
     def test_what_did_not_run_is_named_below(self) -> None:
         text = table([row("bare", {}, failed="ended with code 2: no wheel")])
         assert text.endswith("- fudan on studio, bare: ended with code 2: no wheel")
@@ -77,6 +88,28 @@ class TestTable:
         )
         with pytest.raises(D2Error, match="page needs one line <!-- rows -->"):
             replaced("a", "new", "page")
+
+
+def true_images(folder: Path) -> Path:
+    """A trained view, and a held-out one whose left half moves."""
+    images = np.stack([np.full((4, 6, 3), 50, np.uint8), np.full((4, 6, 3), 150, np.uint8)])
+    moves = np.zeros((2, 4, 6), bool)
+    moves[:, :, :3] = True
+    np.savez(folder / "truth.npz", images=images, moving=moves, held_out=np.array([False, True]))
+    return folder / "truth.npz"
+
+
+def test_what_moves_is_scored_in_held_out_views_alone_and_the_last_comparison_counts(tmp_path: Path) -> None:
+    moving = Moving(true_images(tmp_path))
+    trained, held_out = (torch.full((3, 4, 6), value / 255) for value in (50, 150))
+    moving.see(trained, trained)
+    assert moving.score() is None
+    drawn = held_out.clone()
+    drawn[:, :, :3] += 0.1
+    for image in (torch.zeros(3, 4, 6), drawn):
+        moving.see(image, held_out)
+    moving.see(torch.zeros(3, 4, 6), torch.ones(3, 4, 6))  # an image that the recording does not have
+    assert moving.score() == pytest.approx(20.0, abs=1e-3), "the still half is exact and does not count"
 
 
 def test_a_model_that_is_a_module_is_counted_and_told_apart() -> None:
@@ -133,6 +166,7 @@ def checkout(tmp_path: Path) -> Path:
     """fudan's modules in small."""
     folder = tmp_path / "checkouts" / "4d-gaussian-splatting"
     for name, text in {
+        "utils/image_utils.py": "def psnr(image, truth): return None\n",
         "scene/__init__.py": "from mimics import fudan\nclass Scene(fudan.Scene): pass\n",
         "scene/gaussian_model.py": "from mimics import fudan\nclass GaussianModel(fudan.GaussianModel): pass\n",
         "gaussian_renderer/__init__.py": "from mimics.fudan import render\n",
@@ -146,10 +180,10 @@ def checkout(tmp_path: Path) -> Path:
 def test_a_trainer_runs_in_its_own_process_and_leaves_rows_and_a_table(
     checkout: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    prior = furnish(tmp_path, monkeypatch) / "prior"
+    prior, truth = furnish(tmp_path, monkeypatch) / "prior", true_images(tmp_path)
 
     def prepared(source: Source, trial: Trial, work: Path) -> Prepared:
-        return Prepared(source, tmp_path, None, prior)
+        return Prepared(source, tmp_path, None, prior, truth)
 
     monkeypatch.setattr("benchmarks.trainers.bench.prepare", prepared)
     monkeypatch.setattr(Source, "seconds", 0.1)
@@ -167,6 +201,7 @@ def test_a_trainer_runs_in_its_own_process_and_leaves_rows_and_a_table(
     assert bare["psnr"] == without["psnr"] == {"30": 20.125}
     assert bare["digest"] == without["digest"]
     assert bare["gaussians"] == 60
+    assert bare["psnr_moving"] is None, "this script compares nothing"
     assert "command" in bare
     assert str(tmp_path) not in json.dumps(bare), "no path of this machine"
     assert "| fudan | tiny | 30 | 20.12 | the same bits |" in page.read_text()
@@ -238,6 +273,7 @@ def test_exports_are_made_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(prepare, "export", export)
     (tmp_path / "priors" / "studio-4-2").mkdir(parents=True)
     (tmp_path / "priors" / "studio-4-2" / "store.json").touch()
+    (tmp_path / "studio-4-2.npz").touch()
     source = Source(tmp_path / "studio", 4, 2)
     first, second = (prepare.prepare(source, TRIALS["hust4d"], tmp_path) for _ in range(2))
     assert first == second

@@ -44,7 +44,7 @@ class GaussianModel(InriaModel):
         super().create_from_pcd(points, colors, scale)
         self._set("_xyz_disp", torch.zeros(len(points), 3))
         shapes = ((2, 3), (1, 3), (15, 3), (3,), (1,), (2, 1), (2, 1), (2, 4))
-        for (_, attribute), shape in zip(DYNAMIC, shapes, strict=True):
+        for (_, attribute), shape in zip(DYNAMIC, shapes):
             self._set(attribute, torch.empty(0, *shape))
 
     def rates(self, opt: SimpleNamespace) -> dict[str, float]:
@@ -95,7 +95,7 @@ class GaussianModel(InriaModel):
                 self._swap(group, torch.cat([group["params"][0], rows]), padded)
 
     def _added(self, columns: tuple[tuple[str, str], ...], values: tuple[Tensor, ...]) -> None:
-        self.cat_tensors_to_optimizer({name: value for (name, _), value in zip(columns, values, strict=True)})
+        self.cat_tensors_to_optimizer({name: value for (name, _), value in zip(columns, values)})
         self._zero_accumulators()
         self.max_radii2D = torch.zeros(len(self._xyz))
         self.min_radii2D = torch.full((len(self._xyz),), 1000.0)
@@ -160,7 +160,7 @@ class GaussianModel(InriaModel):
 
     def restore(self, model_args: tuple[object, ...], training_args: SimpleNamespace) -> None:
         super().restore(model_args[0], training_args)
-        for name, value in zip(self.saved, model_args[1], strict=True):
+        for name, value in zip(self.saved, model_args[1]):
             setattr(self, name, value.clone())
 
 

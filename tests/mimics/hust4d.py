@@ -43,7 +43,7 @@ class DeformNetwork(nn.Module):
         pairs = unit[:, :2], torch.cat([unit[:, 2:], times_sel], -1)
         looked = [
             nn.functional.grid_sample(plane, at[None, None], align_corners=True, padding_mode="border")[0, :, 0].T
-            for plane, at in zip(self.planes, pairs, strict=True)
+            for plane, at in zip(self.planes, pairs)
         ]
         offset = 0.1 * self.decoder(looked[0] * looked[1])
         return (

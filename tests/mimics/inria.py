@@ -226,7 +226,7 @@ class InriaModel:
 
     def _append(self, values: tuple[Tensor | None, ...]) -> None:
         """The evidence of every Gaussian is erased, as in all these repositories."""
-        self.cat_tensors_to_optimizer({name: value for (name, _), value in zip(self.columns, values, strict=True)})
+        self.cat_tensors_to_optimizer({name: value for (name, _), value in zip(self.columns, values)})
         self._zero_accumulators()
         self.max_radii2D = torch.zeros(len(self._xyz))
 
@@ -278,10 +278,10 @@ class InriaModel:
 
     def restore(self, model_args: tuple[object, ...], training_args: SimpleNamespace) -> None:
         values, evidence, opt_dict = model_args
-        for (_, attribute), value in zip(self.columns, values, strict=True):
+        for (_, attribute), value in zip(self.columns, values):
             self._set(attribute, value.detach().clone())
         self.training_setup(training_args)
-        for name, value in zip((*self.accumulated, "max_radii2D"), evidence, strict=True):
+        for name, value in zip((*self.accumulated, "max_radii2D"), evidence):
             setattr(self, name, value.clone())
         self.optimizer.load_state_dict(opt_dict)
 
