@@ -59,6 +59,7 @@ def test_nothing_is_written_inside_the_images_of_a_recording(recording: Path, tm
             ["bench", "training", f"{recording}@cam00+cam01"],
         ):  # fmt: skip
             assert "where every folder is a camera" in refused(*words, "--output", place)
+        assert "where every folder is a camera" in refused("compare", run, "--page", place / "deep.html")
         with pytest.raises(D2Error, match="where every folder is a camera"):
             PriorStore.create(place, ["a"], [0], {})
     assert not (recording / "images" / "zz").exists()
