@@ -48,6 +48,10 @@ def test_a_prior_that_was_mistyped_is_not_built(recording: Path, tmp_path: Path,
     assert not list(tmp_path.iterdir())
 
 
+def test_a_comparison_of_no_run_is_refused(refused: Refused) -> None:
+    assert "no run is given" in refused("compare", "")
+
+
 def test_nothing_is_written_inside_the_images_of_a_recording(recording: Path, tmp_path: Path, refused: Refused) -> None:
     (tmp_path / "room").symlink_to(recording)
     for place in (recording / "images" / "zz", tmp_path / "room" / "images" / "zz" / "deeper"):

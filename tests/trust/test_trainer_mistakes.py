@@ -64,7 +64,7 @@ def verified(prior: DepthPrior, depth: float) -> DepthPrior:
         (lambda prior: prior._replace(reliability=-prior.depth), "reliability outside of 0..1"),
         (lambda prior: prior._replace(depth=prior.depth.numpy()), "has no depth as a map"),
         (lambda prior: prior._replace(depth=prior.depth.long()), "not float32: give depth, sigma and reliability"),
-        (lambda prior: prior._replace(depth=prior.depth.double()), "not float32: give depth, sigma and reliability"),
+        (lambda prior: prior._replace(depth=prior.depth.bfloat16()), "not float32: give depth, sigma and reliability"),
         (lambda prior: prior._replace(sigma=prior.depth.half()), "not float32: give depth, sigma and reliability"),
         (lambda prior: prior._replace(labels=torch.full_like(prior.labels, 9)), "has 768 labels that are none"),
         *((lambda prior, depth=depth: prior._replace(depth=torch.full_like(prior.depth, depth)), "of 744 pixels .* 744")
@@ -75,6 +75,14 @@ def verified(prior: DepthPrior, depth: float) -> DepthPrior:
 def test_a_prior_that_cannot_be_is_refused(change: Callable[[DepthPrior], object], says: str) -> None:
     with pytest.raises(D2Error, match=f"the prior of camera cam0, frame 0 .*{says}"):
         hooks(ChangedStore(change)).loss(1, VIEWS[0])
+
+
+def test_a_prior_in_float64_densifies() -> None:
+    d2 = hooks(ChangedStore(lambda prior: prior._replace(depth=prior.depth.double())))
+    for step in range(1, 7):
+        d2.loss(step, VIEWS[0])
+        d2.step(step)
+    assert int((d2.inserted_at > 0).sum()) > 0
 
 
 @pytest.mark.parametrize("depth", [float("nan"), float("inf"), -3.0, 0.0])
