@@ -25,9 +25,6 @@ MEMBERS = ("settings", "__len__", "view", "slice_at", "insert", "remove", "on_re
 SKEWED = 0.01
 """Largest entry of R R^T - 1 of a pose: float32 and calibrations in text stay far below."""
 
-EXACT = (torch.float32, torch.float64)
-"""Of a prior's depth, sigma and reliability: 16 bits are too few for a depth."""
-
 BLOCK = 8
 """Side in pixels of the blocks over which the colours of two images are averaged before they are compared."""
 OTHER_COLOR, OTHER_BLOCKS = 0.1, 0.01
@@ -139,7 +136,7 @@ def check_prior(prior: object, name: str) -> str:
     depth, labels, colors, sigma, reliability = prior
     if not all(m is None or _has_numbers(m) for m in prior) or depth is None or labels is None or depth.ndim != 2:
         raise D2Error(f"{name} has no depth as a map [H, W], or no labels: give tensors")
-    if any(part is not None and part.dtype not in EXACT for part in (depth, sigma, reliability)):
+    if any(part is not None and part.dtype not in (torch.float32, torch.float64) for part in (depth, sigma, reliability)):
         raise D2Error(f"{name} has maps that are not float32: give depth, sigma and reliability as float32")
     if any(part is not None and part.shape != depth.shape for part in (labels, sigma, reliability)):
         raise D2Error(f"{name} has maps of several sizes: give all of them {tuple(depth.shape)} as its depth")
