@@ -136,7 +136,8 @@ def check_prior(prior: object, name: str) -> str:
     depth, labels, colors, sigma, reliability = prior
     if not all(m is None or _has_numbers(m) for m in prior) or depth is None or labels is None or depth.ndim != 2:
         raise D2Error(f"{name} has no depth as a map [H, W], or no labels: give tensors")
-    if any(part is not None and part.dtype not in (torch.float32, torch.float64) for part in (depth, sigma, reliability)):
+    exact = (torch.float32, torch.float64)  # 16 bits are too few for a depth
+    if any(part is not None and part.dtype not in exact for part in (depth, sigma, reliability)):
         raise D2Error(f"{name} has maps that are not float32: give depth, sigma and reliability as float32")
     if any(part is not None and part.shape != depth.shape for part in (labels, sigma, reliability)):
         raise D2Error(f"{name} has maps of several sizes: give all of them {tuple(depth.shape)} as its depth")
