@@ -52,9 +52,9 @@ plane of ones changes nothing. Official names: plane_tv_weight, time_smoothness_
 class MlpSettings(Settings):
     """Network of `MlpField`."""
 
-    width: Annotated[int, Range(1, 8192)] = 64
+    width: Annotated[int, Range(1, 1024)] = 64
     """Neurons of a hidden layer. Official: 256, on a GPU."""
-    depth: Annotated[int, Range(1, 64)] = 4
+    depth: Annotated[int, Range(1, 16)] = 4
     """Hidden layers, with a skip connection to the middle one. Official: 8."""
     rate: LearningRate = 2e-3
     """Learning rate of the network at the first step. Official: 8e-4."""
@@ -64,19 +64,19 @@ class MlpSettings(Settings):
 class HexPlaneSettings(Settings):
     """Planes and network of `HexPlaneField`."""
 
-    features: Annotated[int, Range(1, 256)] = 16
+    features: Annotated[int, Range(1, 64)] = 16
     """Channels of each plane."""
-    resolutions: tuple[Annotated[int, Range(1, 1024)], ...] = (16, 32)
+    resolutions: tuple[Annotated[int, Range(1, 512)], ...] = (16, 32)
     """Nodes of the planes along each axis of space, one number per level. Official: 64 and 128."""
-    instants: Annotated[int, Range(1, 10_000)] = 10
+    instants: Annotated[int, Range(1, 1000)] = 10
     """Nodes of the planes along time. Official: half the number of frames."""
     network_rate: LearningRate = 3e-4
     """Learning rate of the network at the first step."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not self.resolutions:
-            raise D2Error("setting resolutions has no level: give at least one number of nodes")
+        if not 1 <= len(self.resolutions) <= 8:
+            raise D2Error(f"setting resolutions has {len(self.resolutions)} levels: give one to eight numbers of nodes")
 
 
 class Box(NamedTuple):

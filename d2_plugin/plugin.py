@@ -42,7 +42,7 @@ from d2_plugin.hooks.views import ViewSampler
 from d2_plugin.protocol import Backbone, Edit, Points, View, call_optional
 from d2_plugin.reading import said
 from d2_plugin.registry import ADAPTERS, load
-from d2_plugin.values import checked_arguments
+from d2_plugin.values import checked_arguments, fitting
 
 _log = logging.getLogger(__name__)
 
@@ -84,6 +84,7 @@ class D2Hooks:
     ) -> None:
         """The silent form of `from_config`, which documents the arguments."""
         check_backbone(backbone)
+        fitting(D2Config, config, "config of D2Hooks")
         self.config, self.backbone = config, backbone
         self.hooks: dict[str, Hook] = {name: HOOKS[name].hook(getattr(config, name)) for name in config.hooks}
         self.hooks |= _of_other_names(hooks or {})

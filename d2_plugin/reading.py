@@ -90,7 +90,7 @@ def read_text(path: Path | str, remedy: str = RESTORE, most: int = MOST_TEXT) ->
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as failure:
-        raise Unreadable(f"{shown_path(path)} is no UTF-8 text ({said(failure)}): {remedy}") from None
+        raise Unreadable(f"{shown_path(path)} is no UTF-8 text (byte {failure.start}): {remedy}") from None
 
 
 def read_json(path: Path | str, remedy: str = RESTORE) -> dict[str, Any]:

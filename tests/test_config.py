@@ -43,9 +43,12 @@ def run(table: dict[str, Any]) -> RunSettings:
         (
             deform.settings_from,
             {"hexplane": {"resolutions": [8, 0]}},
-            r"resolutions\[1\] must be at least 1 and at most 1024, got 0",
+            r"resolutions\[1\] must be at least 1 and at most 512, got 0",
         ),
-        (deform.settings_from, {"hexplane": {"resolutions": []}}, r"resolutions has no level: give at least one"),
+        (deform.settings_from, {"hexplane": {"resolutions": []}}, r"resolutions has 0 levels: give one to eight"),
+        (deform.settings_from, {"hexplane": {"resolutions": [1] * 9}}, r"resolutions has 9 levels: give one to eight"),
+        (deform.settings_from, {"hexplane": {"instants": 1001}}, r"instants must be .* at most 1000"),
+        (deform.settings_from, {"mlp": {"width": 8192}}, r"width must be .* at most 1024"),
         (deform.settings_from, {"field": "hexplan"}, r"unknown backbone\.field 'hexplan': have hexplane, mlp; did you"),
         (
             deform.settings_from,

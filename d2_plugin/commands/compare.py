@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
+from d2_plugin.errors import D2Error
 from d2_plugin.settings import Positional, Settings
 
 
@@ -24,7 +25,11 @@ def run(settings: Comparison) -> str:
     from d2_plugin.runs.saved import read_metrics
     from d2_plugin.runs.tables import metrics_table
 
-    table = metrics_table({folder.name: read_metrics(folder) for folder in settings.run_folders})
+    if not settings.run_folders:
+        raise D2Error("no run is given: name the --output folders of `d2 train`")
+    names = [folder.resolve().name for folder in settings.run_folders]
+    rows = {n if names.count(n) == 1 else str(f): read_metrics(f) for n, f in zip(names, settings.run_folders)}
+    table = metrics_table(rows)
     if settings.page is None:
         return table
     from d2_plugin.viewing.export.page import write_page

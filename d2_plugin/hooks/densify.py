@@ -108,11 +108,12 @@ def frustum_cells(view: View, points: Tensor, stride: float, depth_step: float) 
     Cells are `stride` pixels wide and `depth_step` (relative) deep, so they grow with distance as the prior's own
     uncertainty does. Two points in one cell describe the same piece of surface.
     """
-    camera = points @ view.T_camera_world[:3, :3].T + view.T_camera_world[:3, 3]
+    pose, K = view.T_camera_world.to(points), view.K.to(points)
+    camera = points @ pose[:3, :3].T + pose[:3, 3]
     z = camera[:, 2]
     front = z > 0
     safe = torch.where(front, z, torch.ones_like(z))
-    image = (camera / safe[:, None]) @ view.K.T
+    image = (camera / safe[:, None]) @ K.T
     inside = front & (image[:, 0] >= 0) & (image[:, 0] < view.width) & (image[:, 1] >= 0) & (image[:, 1] < view.height)
     image = torch.where(inside[:, None], image, torch.zeros_like(image))
     column, row = (image[:, 0] / stride).long(), (image[:, 1] / stride).long()
@@ -215,7 +216,7 @@ class Densify(Hook):
         region = under_reconstructed(depth, valid, prior.depth, prior.support, self._tau_u(prior))
         pixels = shuffled_pixels(region, generator)
         column, row = pixels.unbind(-1)
-        target = prior.depth[row, column]
+        target = prior.depth[row, column].float()  # as the Gaussians are
         positions = back_project(view, pixels, target)
         spacing = max(config.spacing, math.sqrt(len(pixels) / budget))
         free = torch.nonzero(self._free(view, surveyed.splats, positions, earlier, spacing)).squeeze(1)[:budget]

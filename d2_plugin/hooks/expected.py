@@ -37,6 +37,8 @@ STATE = ("hooks", "views", "generator", "idle", "retired")
 
 def check_backbone(backbone: object) -> None:
     """Refuse what is no backbone, with the members that it lacks."""
+    if isinstance(backbone, type):
+        raise D2Error(f"the backbone is the class {backbone.__name__}: give an object of it, {backbone.__name__}(...)")
     lacks = [name for name in MEMBERS if not hasattr(type(backbone), name) and not hasattr(backbone, name)]
     if lacks:
         raise D2Error(
@@ -73,9 +75,9 @@ def check_view(view: View) -> None:
     name = f"the view of camera {shown(view.camera)} at frame {shown(view.frame)}"
     K, T = view.K, view.T_camera_world
     for matrix, shape, what in ((K, (3, 3), "K"), (T, (4, 4), "T_camera_world")):
-        if not isinstance(matrix, Tensor) or tuple(matrix.shape) != shape:
-            got = tuple(matrix.shape) if isinstance(matrix, Tensor) else type(matrix).__name__
-            raise D2Error(f"{what} of {name} is {got}, expected a tensor {shape}: mend the adapter's view()")
+        if not _has_numbers(matrix) or tuple(matrix.shape) != shape:
+            got = f"{matrix.dtype} {tuple(matrix.shape)}" if isinstance(matrix, Tensor) else type(matrix).__name__
+            raise D2Error(f"{what} of {name} is {got}, expected a plain tensor {shape}: mend the adapter's view()")
         if not bool(torch.isfinite(matrix).all()):
             raise D2Error(f"{what} of {name} has a number that is not finite: correct the camera")
     fx, fy = float(K[0, 0]), float(K[1, 1])
@@ -90,6 +92,13 @@ def check_view(view: View) -> None:
             f"T_camera_world of {name} is no rotation and shift, or K has a number below its diagonal, or the last row "
             "of one of them is not 0 ... 0 1: correct the camera"
         )
+
+
+def _has_numbers(tensor: object) -> bool:
+    """Whether it is a tensor with a real number at every place, in memory."""
+    if not isinstance(tensor, Tensor) or tensor.layout != torch.strided:
+        return False
+    return not (tensor.is_meta or tensor.is_complex() or tensor.is_quantized)
 
 
 def check_splats(splats: Splats, count: int, inserting: bool) -> None:
@@ -125,9 +134,11 @@ def check_prior(prior: object, name: str) -> str:
             "store"
         )
     depth, labels, colors, sigma, reliability = prior
-    plain = [m is None or (isinstance(m, Tensor) and m.layout == torch.strided and not m.is_meta) for m in prior]
-    if not all(plain) or depth is None or labels is None or depth.ndim != 2 or not depth.is_floating_point():
-        raise D2Error(f"{name} has no depth as a map [H, W] of floating-point numbers: give tensors")
+    if not all(m is None or _has_numbers(m) for m in prior) or depth is None or labels is None or depth.ndim != 2:
+        raise D2Error(f"{name} has no depth as a map [H, W], or no labels: give tensors")
+    exact = (torch.float32, torch.float64)  # 16 bits are too few for a depth
+    if any(part is not None and part.dtype not in exact for part in (depth, sigma, reliability)):
+        raise D2Error(f"{name} has maps that are not float32: give depth, sigma and reliability as float32")
     if any(part is not None and part.shape != depth.shape for part in (labels, sigma, reliability)):
         raise D2Error(f"{name} has maps of several sizes: give all of them {tuple(depth.shape)} as its depth")
     if colors is not None and (colors.shape != (*depth.shape, 3) or colors.dtype != torch.uint8):

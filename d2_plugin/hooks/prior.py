@@ -229,7 +229,7 @@ class PriorLoader:
         self, store: Store, memory_mb: int = 2048, rename: Rename | None = None, believe: Belief = "all"
     ) -> None:
         """`memory_mb`: what the priors that are kept may take; the one in use is kept whatever it takes."""
-        if not hasattr(store, "prior"):
+        if isinstance(store, type) or not callable(getattr(store, "prior", None)):
             raise D2Error(f"the store is a {type(store).__name__} without prior(camera, frame): give one that has it")
         self.store, self.keep_bytes, self._rename, self.believe = store, memory_mb << 20, rename, believe
         # By camera and frame; frame + 0.5 is halfway to the next.

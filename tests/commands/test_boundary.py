@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 from collections.abc import Callable
+from concurrent.futures.process import BrokenProcessPool
 from functools import partial
 from pathlib import Path
 
@@ -65,6 +66,7 @@ class TestTheBoundary:
             (KeyboardInterrupt(), 130, "stopped: continue with the same command"),
             (OSError(28, "No space left", "/out/x.tmp"), 2, "cannot use /out/x.tmp (No space left): mend that or"),
             (MemoryError(), 2, "make images smaller with --downscale 2"),
+            (BrokenProcessPool("A process was terminated abruptly"), 2, "run it again with fewer --jobs"),
             (RuntimeError("DefaultCPUAllocator: can't allocate memory: 9 bytes"), 2, "smaller with --downscale 2"),
         ],
     )

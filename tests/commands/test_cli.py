@@ -150,6 +150,15 @@ def test_compare_tabulates_what_was_measured(finished: Path, capsys: pytest.Capt
     assert cells["LPIPS"] == "-"
 
 
+def test_compare_keeps_runs_of_one_name_apart(
+    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = shutil.copytree(finished, tmp_path / finished.name)
+    assert main(["compare", str(finished), str(other)]) == 0
+    rows = capsys.readouterr().out.splitlines()[2:]
+    assert [row.split("|")[1].strip() for row in rows] == [str(finished), str(other)]
+
+
 def test_plan_names_each_decision_with_its_measurement(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["plan", str(recording), "--train-cameras", CAMERAS]) == 0
     notes, lines = [], []

@@ -48,6 +48,10 @@ def test_a_prior_that_was_mistyped_is_not_built(recording: Path, tmp_path: Path,
     assert not list(tmp_path.iterdir())
 
 
+def test_a_comparison_of_no_run_is_refused(refused: Refused) -> None:
+    assert "no run is given" in refused("compare", "")
+
+
 def test_nothing_is_written_inside_the_images_of_a_recording(recording: Path, tmp_path: Path, refused: Refused) -> None:
     (tmp_path / "room").symlink_to(recording)
     for place in (recording / "images" / "zz", tmp_path / "room" / "images" / "zz" / "deeper"):
@@ -59,6 +63,7 @@ def test_nothing_is_written_inside_the_images_of_a_recording(recording: Path, tm
             ["bench", "training", f"{recording}@cam00+cam01"],
         ):  # fmt: skip
             assert "where every folder is a camera" in refused(*words, "--output", place)
+        assert "where every folder is a camera" in refused("compare", run, "--page", place / "deep.html")
         with pytest.raises(D2Error, match="where every folder is a camera"):
             PriorStore.create(place, ["a"], [0], {})
     assert not (recording / "images" / "zz").exists()

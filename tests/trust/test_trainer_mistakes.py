@@ -63,7 +63,9 @@ def verified(prior: DepthPrior, depth: float) -> DepthPrior:
         (lambda prior: prior._replace(colors=torch.rand(24, 32, 3)), "give uint8"),
         (lambda prior: prior._replace(reliability=-prior.depth), "reliability outside of 0..1"),
         (lambda prior: prior._replace(depth=prior.depth.numpy()), "has no depth as a map"),
-        (lambda prior: prior._replace(depth=prior.depth.long()), "has no depth as a map"),
+        (lambda prior: prior._replace(depth=prior.depth.long()), "not float32: give depth, sigma and reliability"),
+        (lambda prior: prior._replace(depth=prior.depth.bfloat16()), "not float32: give depth, sigma and reliability"),
+        (lambda prior: prior._replace(sigma=prior.depth.half()), "not float32: give depth, sigma and reliability"),
         (lambda prior: prior._replace(labels=torch.full_like(prior.labels, 9)), "has 768 labels that are none"),
         *((lambda prior, depth=depth: prior._replace(depth=torch.full_like(prior.depth, depth)), "of 744 pixels .* 744")
           for depth in (float("nan"), float("inf"), -3.0, 0.0)),
@@ -73,6 +75,14 @@ def verified(prior: DepthPrior, depth: float) -> DepthPrior:
 def test_a_prior_that_cannot_be_is_refused(change: Callable[[DepthPrior], object], says: str) -> None:
     with pytest.raises(D2Error, match=f"the prior of camera cam0, frame 0 .*{says}"):
         hooks(ChangedStore(change)).loss(1, VIEWS[0])
+
+
+def test_a_prior_in_float64_densifies() -> None:
+    d2 = hooks(ChangedStore(lambda prior: prior._replace(depth=prior.depth.double())))
+    for step in range(1, 7):
+        d2.loss(step, VIEWS[0])
+        d2.step(step)
+    assert int((d2.inserted_at > 0).sum()) > 0
 
 
 @pytest.mark.parametrize("depth", [float("nan"), float("inf"), -3.0, 0.0])
@@ -104,6 +114,13 @@ def test_a_pose_that_cannot_be_is_refused(name: str) -> None:
         hooks().loss(1, replace(view, T_camera_world=pose, K=K))
 
 
+@pytest.mark.parametrize("change", [lambda m: m.to("meta"), lambda m: m.to_sparse(), lambda m: m + 0j])
+@pytest.mark.parametrize("name", ["K", "T_camera_world"])
+def test_a_matrix_without_real_numbers_is_refused(name: str, change: Callable[[Tensor], Tensor]) -> None:
+    with pytest.raises(D2Error, match=f"{name} of the view .* expected a plain tensor"):
+        hooks().loss(1, replace(VIEWS[0], **{name: change(getattr(VIEWS[0], name))}))
+
+
 @pytest.mark.parametrize(("name", "value"), [("time", "x"), ("time", math.nan), ("frame", 0.5), ("camera", None)])
 def test_what_a_view_is_called_is_looked_at(name: str, value: object) -> None:
     with pytest.raises(D2Error, match=f"the {name} of a view must be"):
@@ -130,9 +147,21 @@ def test_a_step_that_falls_repeats_or_differs_is_named_once(caplog: pytest.LogCa
         assert caplog.text.count("which rises from one to the next") == 1
 
 
-def test_a_store_without_priors_is_refused() -> None:
-    with pytest.raises(D2Error, match=r"the store is a object without prior\(camera, frame\)"):
-        hooks(object())
+@pytest.mark.parametrize("store", [object(), SimpleNamespace(prior=5), TinyStore])
+def test_a_store_without_priors_is_refused(store: object) -> None:
+    with pytest.raises(D2Error, match=r"the store is a \w+ without prior\(camera, frame\)"):
+        hooks(store)
+
+
+@pytest.mark.parametrize("config", [None, 5, {}, D2Config, DensifyConfig()])
+def test_what_is_no_configuration_is_refused(config: object) -> None:
+    with pytest.raises(D2Error, match="config of D2Hooks must be a table of settings"):
+        hooks(config=config)
+
+
+def test_a_class_in_the_place_of_an_adapter_is_refused() -> None:
+    with pytest.raises(D2Error, match=r"the backbone is the class Yang4DAdapter: give an object of it"):
+        hooks(adapter=Yang4DAdapter)
 
 
 class Lazy(Yang4DAdapter):

@@ -82,8 +82,8 @@ def messages_of(viewer: Viewer) -> list[dict[str, Any]]:
 
     page, _ = list(viewer._pages.values())[-1]
     updates = [
-        {"type": "GuiUpdateMessage", "uuid": control._impl.uuid, "updates": {"value": control._impl.value}}
-        for control in page.controls.values()
+        {"type": "GuiUpdateMessage", "uuid": uuid, "updates": {"value": control._impl.value}}
+        for uuid, control in page.client.gui._gui_input_handle_from_uuid.items()
     ]
     kinds = [kind for kind in _messages.Message.get_subclasses() if hasattr(kind, "__dataclass_fields__")]
     known = [{"type": kind.__name__, **dict.fromkeys(kind.__dataclass_fields__, "")} for kind in kinds]
@@ -109,7 +109,12 @@ def test_only_what_the_page_sends_comes_in(viewed: ViewedRun, monkeypatch: pytes
 
 @pytest.mark.parametrize(("count", "seed"), [(FEW, 0), pytest.param(MANY, SEED, marks=pytest.mark.slow)])
 def test_messages_at_random(
-    viewed: ViewedRun, count: int, seed: int, capfd: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+    viewed: ViewedRun,
+    count: int,
+    seed: int,
+    capfd: pytest.CaptureFixture[str],
+    caplog: pytest.LogCaptureFixture,
+    recwarn: pytest.WarningsRecorder,
 ) -> None:
     with showing(viewed) as viewer, connected(viewer) as looker:
         drawn(viewer, 1)
@@ -137,3 +142,23 @@ def test_messages_at_random(
     assert "Traceback" not in said.err + said.out + caplog.text, (said, caplog.text)
     assert "Task" not in said.err + said.out, said
     assert "is not drawn any more" not in caplog.text, caplog.text
+    assert not [said for said in recwarn if "viser" in str(said.message)], "what a client sent is printed"
+
+
+def test_keyframes_come_and_go_while_the_path_is_asked_for(
+    viewed: ViewedRun, capfd: pytest.CaptureFixture[str]
+) -> None:
+    with showing(viewed) as viewer, connected(viewer) as socket:
+        drawn(viewer, 1)
+        [(page, _)] = viewer._pages.values()
+        buttons = {
+            control.label: {"type": "GuiUpdateMessage", "uuid": uuid, "updates": {"value": True}}
+            for uuid, control in page.client.gui._gui_input_handle_from_uuid.items()
+        }
+        clicks = ["Add keyframe"] * 40 + ["Save camera_path.json", "Preview", "Remove the last", "Add keyframe"] * 100
+        for label in clicks:
+            socket.send(msgpack.encode(buttons[label]))
+        until(lambda: len(page.keyframes) == 40)
+        until(lambda: page._previewed is not None)
+    said = capfd.readouterr()
+    assert "Traceback" not in said.err + said.out, said

@@ -8,6 +8,7 @@ import sys
 import threading
 import traceback
 from collections.abc import Callable, Iterator
+from concurrent.futures import BrokenExecutor
 from contextlib import contextmanager, suppress
 
 from d2_plugin.errors import D2Error
@@ -79,6 +80,8 @@ def sentence(failure: BaseException) -> str:
         return "stopped: continue with the same command"
     if isinstance(failure, MemoryError) or any(words in str(failure).lower() for words in OUT_OF_MEMORY):
         return "more memory is needed than there is: make images smaller with --downscale 2, or take fewer --frames"
+    if isinstance(failure, BrokenExecutor):
+        return "a worker process was ended from outside, or for want of memory: run it again with fewer --jobs"
     if isinstance(failure, OSError):
         places = [shown_path(name) for name in (failure.filename, failure.filename2) if isinstance(name, str | bytes)]
         where = " and ".join(places) or "a file or a connection"

@@ -92,8 +92,9 @@ class Form:
             for part in path:
                 table = table.setdefault(part, {})
             table[last] = _as_toml(value) if path else value
-        if isinstance(values.get("output"), Path):
-            refuse_inside_images(values["output"])
+        for place in (values.get("output"), values.get("page")):
+            if isinstance(place, Path):
+                refuse_inside_images(place)
         missing = [typed_as(setting) for setting in self.settings if setting.name not in values]
         if missing:
             raise D2Error(f"{self.command} needs {' and '.join(missing)}: `{self.command} --help` says what that is")

@@ -32,7 +32,7 @@ IMAGES = {"image": "rgb", "error": "error", "depth": "depth", "opacity": "alpha"
 """What the menu says -> the kind of image."""
 AT_CAMERA = 1e-3
 """Of the numbers of a pose, relative to a camera's distance: who is so near stands at the camera."""
-MOST_KEYFRAMES, PATH_SIZE = 1000, (1280, 720)
+MOST_KEYFRAMES, PATH_SIZE = 100, (1280, 720)
 """Of a camera path, and the pixels of its images."""
 PATH_RATE = 30.0
 """Images per second of a camera path."""
@@ -181,17 +181,18 @@ class Page:
 
     def path(self) -> list[tuple[Camera, float]]:
         """The cameras from keyframe to keyframe, with their instants in seconds."""
-        chain = [key.camera(*PATH_SIZE) for key in self.keyframes]
+        keys = tuple(self.keyframes)  # other threads of viser add and remove meanwhile
+        chain = [key.camera(*PATH_SIZE) for key in keys]
         seconds = self.number("path_seconds", 2.0) * (len(chain) - 1)
         places = np.linspace(0, len(chain) - 1, max(round(seconds * PATH_RATE), 1)).tolist() if chain else []
-        times = [float(np.interp(place, range(len(chain)), [key.time for key in self.keyframes])) for place in places]
+        times = [float(np.interp(place, range(len(chain)), [key.time for key in keys])) for place in places]
         return [(between(chain, place), instant) for place, instant in zip(places, times)]
 
     def path_file(self) -> bytes:
         """The path as nerfstudio's camera_path.json."""
-        cameras = [camera for camera, _ in self.path()]
-        shares = [instant / max(self.viewed.duration, 1e-9) for _, instant in self.path()]
-        return camera_path_text(cameras, shares, PATH_RATE).encode()
+        path = self.path()
+        shares = [instant / max(self.viewed.duration, 1e-9) for _, instant in path]
+        return camera_path_text([camera for camera, _ in path], shares, PATH_RATE).encode()
 
     def _save(self) -> None:
         if self.keyframes:

@@ -47,8 +47,8 @@ def serve(host: str, port: int) -> Page:
         D2Error: nothing can listen at that address.
     """
     _check_address(host)
-    # Of a page that was closed while its image was drawn.
-    warnings.filterwarnings("ignore", "Queued a .* on a closed connection")
+    # Of a page that was closed while its image was drawn, and of what a client sent.
+    warnings.filterwarnings("ignore", r"Queued a .* on a closed connection|\[viser\] ")
     token = secrets.token_urlsafe(16)
     viser = imported("viser", "viser", "view", "the live viewer")
     # It prints a table with addresses.
