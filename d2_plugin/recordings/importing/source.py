@@ -128,7 +128,9 @@ class VideosSource(Source):
 
     def checked(self, recording: Recording) -> Recording:
         """Smaller images of some moments of a recording out of here, decoded once for all that is checked on them."""
-        smaller = {name: min(LONG_SIDE / max(camera.width, camera.height), 1) for name, camera in self.pinholes().items()}
+        smaller = {
+            name: min(LONG_SIDE / max(camera.width, camera.height), 1) for name, camera in self.pinholes().items()
+        }
         cuts = {name: replace(cut, scale=cut.scale * smaller[name]) for name, cut in self.cuts.items()}
         source, frames = replace(self, cuts=cuts), tuple(spread(recording.frames, MOMENTS))
         images = {name: {frame: source.image(name, frame) for frame in frames} for name in cuts}
