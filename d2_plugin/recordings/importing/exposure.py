@@ -15,9 +15,8 @@ from d2_plugin.recordings.cameras.epipolar import epipolar_lines, homogeneous, s
 from d2_plugin.recordings.images import opencv
 from d2_plugin.recordings.importing.clocks import linked_names
 from d2_plugin.recordings.recording import Camera, Exposure, Recording
-from d2_plugin.recordings.selection import downscale, spread
+from d2_plugin.recordings.selection import spread
 
-LONG_SIDE = 960  # pixels of the longer side at most: smaller images say the same of a gain
 FRAMES = 6  # instants at which features are looked for, at most
 KNOWN = 0.004  # standard error of all gains at which no more instants are looked at
 FEATURES = 3000  # of an image, at most
@@ -36,8 +35,6 @@ def measured_exposures(recording: Recording, cameras: Sequence[str]) -> dict[str
 
     The logarithms of the ratios of each pair, the median over its matches, are weighed by their errors.
     """
-    side = max(max(camera.width, camera.height) for camera in recording.cameras.values())
-    recording = downscale(recording, -(-side // LONG_SIDE))
     ratios: dict[tuple[str, str], list[np.ndarray]] = {}
     gains: dict[str, Exposure] = {}
     for frame in spread(recording.frames, FRAMES):
