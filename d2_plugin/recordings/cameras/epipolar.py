@@ -19,7 +19,12 @@ LARGEST_TURN = 0.05  # radians of one step
 
 
 def sift_features(
-    image: np.ndarray, most: int, purpose: str, contrast: float = OPENCVS_CONTRAST, mask: np.ndarray | None = None
+    image: np.ndarray,
+    most: int,
+    purpose: str,
+    contrast: float = OPENCVS_CONTRAST,
+    mask: np.ndarray | None = None,
+    tilted: bool = False,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(pixels [n, 2] with centres at i + 0.5, descriptors [n, 128], (size in pixels, angle in radians) [n, 2]).
 
@@ -29,11 +34,13 @@ def sift_features(
         purpose: what needs OpenCV, in the sentence that says where it is missing.
         contrast: of a feature, at least.
         mask: bool [H, W], where features may lie.
+        tilted: in the image as nine cameras would see it from aside (Morel and Yu 2009: ASIFT), `most` in each.
     """
     cv2 = opencv(purpose, "calibration")
     grey = cv2.cvtColor(checked_image(image, "the image of a camera"), cv2.COLOR_RGB2GRAY)
     # Without `enable_precise_upscale` OpenCV's SIFT is a quarter of a pixel too far right and down.
     sift = cv2.SIFT_create(most, contrastThreshold=contrast, enable_precise_upscale=True)
+    sift = cv2.AffineFeature_create(sift, 2, 1) if tilted else sift
     points, descriptors = sift.detectAndCompute(grey, None if mask is None else mask.astype(np.uint8))
     pixels = np.array([point.pt for point in points]).reshape(-1, 2) + 0.5
     shapes = np.array([(point.size, np.deg2rad(point.angle)) for point in points]).reshape(-1, 2)

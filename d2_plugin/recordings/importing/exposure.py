@@ -15,10 +15,10 @@ from d2_plugin.recordings.cameras.epipolar import epipolar_lines, homogeneous, s
 from d2_plugin.recordings.images import opencv
 from d2_plugin.recordings.importing.clocks import linked_names
 from d2_plugin.recordings.recording import Camera, Exposure, Recording
-from d2_plugin.recordings.selection import downscale, spread
+from d2_plugin.recordings.selection import spread
 
-LONG_SIDE = 960  # pixels of the longer side at most: smaller images say the same of a gain
-FRAMES = 6  # instants at which features are looked for
+FRAMES = 6  # instants at which features are looked for, at most
+KNOWN = 0.004  # standard error of all gains at which no more instants are looked at
 FEATURES = 3000  # of an image, at most
 DIAGONAL = 1 / 800  # of the image: how far a feature may lie from where its triangulated point falls
 DISTINCT = 0.8  # A match is kept where the second best is this much farther away (Lowe 2004)
@@ -35,9 +35,8 @@ def measured_exposures(recording: Recording, cameras: Sequence[str]) -> dict[str
 
     The logarithms of the ratios of each pair, the median over its matches, are weighed by their errors.
     """
-    side = max(max(camera.width, camera.height) for camera in recording.cameras.values())
-    recording = downscale(recording, -(-side // LONG_SIDE))
     ratios: dict[tuple[str, str], list[np.ndarray]] = {}
+    gains: dict[str, Exposure] = {}
     for frame in spread(recording.frames, FRAMES):
         images = {name: recording.image(name, frame) for name in cameras}
         features = {name: sift_features(image, FEATURES, "measuring exposure")[:2] for name, image in images.items()}
@@ -46,8 +45,11 @@ def measured_exposures(recording: Recording, cameras: Sequence[str]) -> dict[str
             if len(p):
                 a, b = _around(images[one], p), _around(images[other], q)
                 ratios.setdefault((one, other), []).append(b - a)
-    joined = {pair: np.concatenate(parts) for pair, parts in ratios.items()}
-    return _gains(cameras, {pair: _middle(values) for pair, values in joined.items() if len(values) >= FEWEST})
+        joined = {pair: np.concatenate(parts) for pair, parts in ratios.items()}
+        gains = _gains(cameras, {pair: _middle(values) for pair, values in joined.items() if len(values) >= FEWEST})
+        if len(gains) == len(cameras) and max(max(one.error) for one in gains.values()) < KNOWN:
+            break
+    return gains
 
 
 _Features = tuple[np.ndarray, np.ndarray]
@@ -59,12 +61,12 @@ def _matched(one: Camera, other: Camera, features: _Features, others: _Features)
     if not len(p) or not len(q) or np.allclose(one.centre, other.centre):
         return np.zeros((0, 2)), np.zeros((0, 2))
     reach = max(DIAGONAL * np.hypot(other.width, other.height), 0.7)
-    far = np.abs(epipolar_lines(one, other, p) @ homogeneous(q).T) > 2 * reach
-    products = descriptors @ other_descriptors.T
-    squares = (descriptors**2).sum(1)[:, None] + (other_descriptors**2).sum(1) - 2 * products
-    distance = np.where(far, np.inf, np.sqrt(np.maximum(squares, 0)))
-    best, back = distance.argmin(1), distance.argmin(0)
-    first, second = np.partition(distance, 1, axis=1)[:, :2].T if len(q) > 1 else (distance[:, 0], distance[:, 0])
+    off = epipolar_lines(one, other, p).astype(np.float32) @ homogeneous(q).T.astype(np.float32)
+    squares = (descriptors**2).sum(1)[:, None] + (other_descriptors**2).sum(1) - 2 * descriptors @ other_descriptors.T
+    squares[np.abs(off) > 2 * reach] = np.inf
+    best, back = squares.argmin(1), squares.argmin(0)
+    two = np.partition(squares, 1, axis=1)[:, :2] if len(q) > 1 else squares[:, [0, 0]]
+    first, second = np.sqrt(np.maximum(two, 0)).T
     kept = np.isfinite(first) & (first < DISTINCT * np.minimum(second, LIKELY)) & (back[best] == np.arange(len(p)))
     p, q = p[kept], q[best[kept]]
     near = _consistent(one, other, p, q) if len(p) else np.zeros(0, bool)

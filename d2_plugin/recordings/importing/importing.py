@@ -42,7 +42,7 @@ from d2_plugin.recordings.importing.solved_rig import calibration_table, rig_of_
 from d2_plugin.recordings.importing.source import Cut, VideosSource, cuts_of
 from d2_plugin.recordings.importing.steady import DRIFT, steadiness
 from d2_plugin.recordings.importing.steps import SOLVED, STEPS, identity, kept, paths_of, refuse_another
-from d2_plugin.recordings.importing.video import VideoFile, read_video
+from d2_plugin.recordings.importing.video import VideoFile, decoded_alone, read_video
 from d2_plugin.recordings.readers.videos import KIND as VIDEOS
 from d2_plugin.recordings.readers.videos import TABLE
 from d2_plugin.recordings.recording import Exposure, Recording
@@ -89,19 +89,23 @@ def import_videos(settings: ImportSettings, report: Report = lambda line: None) 
         report(_clocks_in_words(clocks, videos))
         grid = grid_of(videos, clocks, settings.rate, settings.times, settings.frames)
         source = VideosSource(videos, grid.indices, cameras, cuts)
-        frames, more = tuple(grid.indices[next(iter(videos))]), _notes_of_videos(settings, videos, grid.indices)
-        notes = (*notes, *_notes_of_clocks(clocks), *grid.notes, *more)
+        frames, notes = tuple(grid.indices[next(iter(videos))]), (*notes, *_notes_of_clocks(clocks), *grid.notes)
         recording = Recording(
             folder.resolve().name, source.pinholes(), frames, grid.rate, source, folder, notes=notes, late=grid.late
         )
+        few = source.checked(recording)
+        recording = replace(recording, notes=(*notes, *_notes_of_videos(settings, videos, few)))
         if settings.refine_poses:
             recording = _with_refined_poses(folder, recording, report)
         elif solved is None and len(cameras) > 1:
-            recording = _with_checked_poses(recording, report)
+            recording = _with_checked_poses(recording, few, report)
         if settings.images != "videos":
             _write_images(folder, recording, settings.images, report)
         if settings.exposure and len(recording.cameras) > 1:
-            recording = replace(recording, exposures=_exposures(folder, recording, report))
+            poses = {name: camera.T_camera_world for name, camera in recording.cameras.items()}
+            placed = {name: replace(camera, T_camera_world=poses[name]) for name, camera in few.cameras.items()}
+            exposures = _exposures(folder, replace(few, cameras=placed), report)
+            recording = replace(recording, exposures=exposures)
         description = described(recording)  # last: without this file the folder is no recording
         if isinstance(recording.source, VideosSource) and settings.images == "videos":
             write_table(folder / TABLE, {"cameras": recording.source.as_dict(), "recording": description}, VIDEOS)
@@ -157,8 +161,8 @@ def _oriented(path: Path, videos: Mapping[str, VideoFile]) -> tuple[dict[str, Vi
 
 
 def _contradiction(videos: Mapping[str, VideoFile], cameras: Sequence[CalibratedCamera]) -> tuple[bool, str]:
-    """What the images in the middle of the videos say against the calibration, see `calibration_contradicted`."""
-    indices = {name: {0: len(video.stamps) // 2} for name, video in videos.items()}
+    """What an image near the middle of each video says against the calibration, see `calibration_contradicted`."""
+    indices = {name: {0: decoded_alone(video, len(video.stamps) // 2)} for name, video in videos.items()}
     cuts = {camera.name: Cut(0, 0, *camera.size) for camera in cameras}
     source = VideosSource(videos, indices, {camera.name: camera for camera in cameras}, cuts)
     return calibration_contradicted(Recording("videos", source.pinholes(), (0,), 1.0, source))
@@ -202,9 +206,7 @@ def _notes_of_clocks(clocks: Mapping[str, Clock]) -> tuple[str, ...]:
     return () if guessed is None else (f"the cameras' clocks are {guessed}",)
 
 
-def _notes_of_videos(
-    settings: ImportSettings, videos: Mapping[str, VideoFile], indices: Mapping[str, Mapping[int, int]]
-) -> tuple[str, ...]:
+def _notes_of_videos(settings: ImportSettings, videos: Mapping[str, VideoFile], few: Recording) -> tuple[str, ...]:
     """HDR, exposures that drift, cameras that were moved.
 
     Raises:
@@ -212,11 +214,11 @@ def _notes_of_videos(
     """
     hdr = ", ".join(f"{name} ({video.hdr})" for name, video in videos.items() if video.hdr)
     notes = [f"HDR of {hdr} was converted to BT.709: what is brighter than white paper is white"] if hdr else []
-    for name, steady in steadiness(videos, indices).items():
+    for name, steady in steadiness(few).items():
         if steady.moved:
             first, last = steady.between
-            when = f"between {first:.2f} and {last:.2f} seconds of its video"
-            said = f"camera {name} was moved by {steady.moved:.0f} pixels {when}"
+            when = f"between {first:.2f} and {last:.2f} seconds of the recording"
+            said = f"camera {name} was moved by {steady.moved:.1%} of its image's width {when}"
             if not settings.accept_calibration:
                 raise D2Error(
                     f"{said}: import the parts by themselves (--times), each with its calibration, or give "
@@ -228,10 +230,10 @@ def _notes_of_videos(
     return tuple(notes)
 
 
-def _with_checked_poses(recording: Recording, report: Report) -> Recording:
-    """The recording with a note for each camera whose pose its images contradict."""
+def _with_checked_poses(recording: Recording, few: Recording, report: Report) -> Recording:
+    """The recording with a note for each camera whose pose a few images contradict."""
     try:
-        turns = check_poses(recording)
+        turns = check_poses(few)
     except MissingExtra as missing:
         report(f"poses are not checked: {missing}")
         return recording

@@ -18,7 +18,11 @@ from d2_plugin.recordings.cameras.undistort import UndistortedSource
 from d2_plugin.recordings.images import opencv
 from d2_plugin.recordings.importing.settings import ImportChoices, by_camera
 from d2_plugin.recordings.importing.video import VideoFile, VideoFrames
-from d2_plugin.recordings.recording import Camera, Source
+from d2_plugin.recordings.recording import Camera, Recording, Source
+from d2_plugin.recordings.selection import spread
+
+MOMENTS = 9  # images of each camera that are checked, spread over the recording
+LONG_SIDE = 640  # pixels of the longer side of these, at most
 
 
 @dataclass(frozen=True)
@@ -84,6 +88,16 @@ def cuts_of(choices: ImportChoices, sizes: Mapping[str, tuple[int, int]]) -> dic
 
 
 @dataclass(frozen=True)
+class KeptImages(Source):
+    """Images in memory."""
+
+    images: Mapping[str, Mapping[int, np.ndarray]]  # by camera and frame
+
+    def image(self, camera: str, frame: int) -> np.ndarray:
+        return self.images[camera][frame]
+
+
+@dataclass(frozen=True)
 class VideosSource(Source):
     """The images of a recording that stays in its videos; not for several threads at the same time."""
 
@@ -111,6 +125,16 @@ class VideosSource(Source):
                 "within the video, so choose --times of one size"
             )
         return self.cuts[camera].of(image)
+
+    def checked(self, recording: Recording) -> Recording:
+        """Smaller images of some moments of a recording out of here, decoded once for all that is checked on them."""
+        smaller = {
+            name: min(LONG_SIDE / max(camera.width, camera.height), 1) for name, camera in self.pinholes().items()
+        }
+        cuts = {name: replace(cut, scale=cut.scale * smaller[name]) for name, cut in self.cuts.items()}
+        source, frames = replace(self, cuts=cuts), tuple(spread(recording.frames, MOMENTS))
+        images = {name: {frame: source.image(name, frame) for frame in frames} for name in cuts}
+        return replace(recording, cameras=source.pinholes(), frames=frames, source=KeptImages(images))
 
     def recorded(self, camera: str) -> np.ndarray | None:
         whole = self._undistorted.recorded(camera)

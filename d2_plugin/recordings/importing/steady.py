@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from d2_plugin.recordings.images import opencv
-from d2_plugin.recordings.importing.video import Decoder, VideoFile
-from d2_plugin.recordings.selection import spread
+from d2_plugin.recordings.recording import Recording
 
-MOMENTS = 9  # images of each video, spread over it
 LONG_SIDE = 320  # pixels of the images that are compared
 MOVED = 1.5  # of these pixels: a camera was moved
 EXPLAINS = 0.7  # what moves the image back leaves at most this part of the difference
@@ -22,21 +19,22 @@ USABLE = (10, 245)  # brightness of pixels, of 255, that say something about a g
 class Steadiness(NamedTuple):
     """Of one camera."""
 
-    moved: float  # pixels of the video by which its image jumped; 0 where it stood still
-    between: tuple[float, float]  # seconds of the video between which it was moved
+    moved: float  # share of its image's width by which that jumped; 0 where it stood still
+    between: tuple[float, float]  # seconds of the recording between which it was moved
     drift: float  # brightest over darkest exposure, less 1
 
 
-def steadiness(videos: Mapping[str, VideoFile], indices: Mapping[str, Mapping[int, int]]) -> dict[str, Steadiness]:
-    """What some of the images say that are taken of each video; medians over time hide what moves before the camera."""
-    return {name: _steadiness(video, sorted(set(indices[name].values()))) for name, video in videos.items()}
+def steadiness(recording: Recording) -> dict[str, Steadiness]:
+    """What some images say of each camera; medians over time hide what moves before it."""
+    return {name: _steadiness(recording, name) for name in recording.cameras}
 
 
-def _steadiness(video: VideoFile, taken: Sequence[int]) -> Steadiness:
-    places = spread(taken, MOMENTS)
-    decoder = Decoder(video)
-    images = np.stack([decoder.grey(place, LONG_SIDE) for place in places]).astype(np.float32)
-    decoder.close()
+def _steadiness(recording: Recording, camera: str) -> Steadiness:
+    cv2, width = opencv("comparing images over time"), recording.cameras[camera].width
+    scale = max(max(width, recording.cameras[camera].height) / LONG_SIDE, 1.0)
+    greys = [cv2.cvtColor(recording.image(camera, frame), cv2.COLOR_RGB2GRAY) for frame in recording.frames]
+    small = [cv2.resize(grey, None, fx=1 / scale, fy=1 / scale, interpolation=cv2.INTER_AREA) for grey in greys]
+    images = np.stack(small).astype(np.float32)
     still = np.median(images, axis=0)
     usable = (images > USABLE[0]) & (images < USABLE[1])
     gains = np.array(
@@ -47,11 +45,10 @@ def _steadiness(video: VideoFile, taken: Sequence[int]) -> Steadiness:
     moved = max(jumps, default=0.0)
     changes = np.abs(np.diff(images, axis=0)).mean(axis=(1, 2))
     largest = int(changes.argmax()) if len(changes) else 0
-    seconds = video.times - video.times[0]
-    scale = max(video.stored_size) / max(images.shape[1:])
-    between = (float(seconds[places[largest]]), float(seconds[places[min(largest + 1, len(places) - 1)]]))
+    seconds = np.array(recording.frames) / recording.fps  # from frame 0, as --times counts them
+    between = float(seconds[largest]), float(seconds[min(largest + 1, len(seconds) - 1)])
     drift = float(gains.max() / max(gains.min(), 1e-3) - 1)
-    return Steadiness(moved * scale if moved > MOVED else 0.0, between, drift)
+    return Steadiness(moved / images.shape[2], between, drift) if moved > MOVED else Steadiness(0.0, between, drift)
 
 
 def _jump(before: np.ndarray, after: np.ndarray) -> float:

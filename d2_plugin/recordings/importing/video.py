@@ -210,6 +210,17 @@ def videos_below(folder: Path) -> tuple[Path, ...]:
     return tuple(path for path in paths if not path.name.startswith("."))
 
 
+def decoded_alone(video: VideoFile, index: int) -> int:
+    """The last frame up to `index` that needs no other one, where the container knows it."""
+    if video.counted:
+        return index
+    with container_of(video.path) as container:
+        stream = container.streams.video[0]
+        container.seek(int(video.stamps[index]), stream=stream, backward=True)
+        stamp = next(container.demux(stream)).pts
+    return index if stamp is None else min(int(np.searchsorted(video.stamps, stamp)), index)
+
+
 class Decoder:
     """Decodes one video and remembers where it stands: frames in ascending order are decoded once each."""
 

@@ -18,8 +18,9 @@ from d2_plugin.recordings.cameras.camera import CalibratedCamera
 from d2_plugin.recordings.cameras.lens import Lens
 from d2_plugin.recordings.importing.importing import import_videos
 from d2_plugin.recordings.importing.settings import ImportSettings
-from d2_plugin.recordings.importing.source import Cut, VideosSource
+from d2_plugin.recordings.importing.source import MOMENTS, Cut, VideosSource
 from d2_plugin.recordings.importing.steps import KIND
+from d2_plugin.recordings.importing.video import Decoder
 from d2_plugin.recordings.selection import select_frames
 
 pytest.importorskip("av")
@@ -168,3 +169,18 @@ def test_the_exposures_that_were_measured_are_kept(imported: Path) -> None:
     table = json.loads((imported / "cameras.json").read_text())
     assert set(table["exposures"]) == set(NAMES)
     assert recording.exposures["02"].gain == tuple(table["exposures"]["02"]["gain"])
+
+
+def test_what_is_checked_is_decoded_once(filmed: Filmed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Sound is the clock and nothing is written: one look at the calibration, then each moment once."""
+    asked: list[tuple[str, int]] = []
+    frame_of = Decoder._frame
+
+    def counted(self: Decoder, index: int) -> object:
+        asked.append((self.video.path.stem, index))
+        return frame_of(self, index)
+
+    monkeypatch.setattr(Decoder, "_frame", counted)
+    import_videos(settings_of(filmed, tmp_path / "out", images="videos"))
+    assert len(asked) <= (1 + MOMENTS) * len(NAMES)
+    assert max(map(asked.count, asked)) <= 2

@@ -9,8 +9,12 @@ import pytest
 from recorded import write_video
 
 from d2_plugin.errors import D2Error
+from d2_plugin.recordings.cameras.camera import CalibratedCamera, pinhole
+from d2_plugin.recordings.cameras.lens import Lens
+from d2_plugin.recordings.importing.source import Cut, VideosSource
 from d2_plugin.recordings.importing.steady import steadiness
 from d2_plugin.recordings.importing.video import Decoder, VideoFile, read_video
+from d2_plugin.recordings.recording import Recording
 
 pytest.importorskip("av")
 
@@ -141,9 +145,14 @@ def wall(count: int, shift: int = 0, gain: float = 1.0) -> list[np.ndarray]:
 def test_a_camera_that_was_moved_or_drifts_is_noticed(
     shift: int, gain: float, moved: float, drift: float, tmp_path: Path
 ) -> None:
-    video = read_video(write_video(tmp_path / "a.mp4", wall(24, shift, gain), [i / 24 for i in range(24)]))
-    steady = steadiness({"a": video}, {"a": {i: i for i in range(24)}})["a"]
-    assert steady.moved == pytest.approx(moved, abs=1)
+    path = write_video(tmp_path / "a.mp4", wall(24, shift, gain), [i / 24 for i in range(24)])
+    camera = CalibratedCamera("a", 160, 120, Lens(pinhole(160, 160, 80, 60)), np.eye(4))
+    source = VideosSource(
+        {"a": read_video(path)}, {"a": {i: i for i in range(24)}}, {"a": camera}, {"a": Cut(0, 0, 160, 120)}
+    )
+    recording = Recording("walls", source.pinholes(), tuple(range(24)), 24.0, source)
+    steady = steadiness(source.checked(recording))["a"]
+    assert 160 * steady.moved == pytest.approx(moved, abs=1)
     assert steady.drift == pytest.approx(drift, abs=0.02)
     assert not moved or steady.between[0] <= 0.5 <= steady.between[1]
 

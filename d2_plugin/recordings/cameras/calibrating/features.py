@@ -22,6 +22,7 @@ from d2_plugin.recordings.images import opencv
 from d2_plugin.recordings.recording import Camera
 
 MOST_FEATURES = 4000  # per image
+MOST_TILTED = 800  # the same in each image as seen from aside
 LEAST_CONTRAST = 0.005  # an eighth of OpenCV's: faint features are many, and geometry sorts out false matches
 RATIO = 0.85  # the best match is nearer than the second best by this factor, on square roots of SIFT
 CHANGE = 10.0  # levels of 255 by which an image differs from what usually is there where something moves
@@ -55,16 +56,18 @@ def silent_pycolmap(purpose: str) -> ModuleType:
     return pycolmap
 
 
-def of_a_still_camera(images: Sequence[np.ndarray], recorded: np.ndarray | None = None) -> Features:
+def of_a_still_camera(
+    images: Sequence[np.ndarray], recorded: np.ndarray | None = None, tilted: bool = False
+) -> Features:
     """Features of what stands still, once and as moment 0, then of what moves in each of the images.
 
-    A wall that is seen at ten moments is one witness, not ten.
+    A wall that is seen at ten moments is one witness, not ten. `tilted` as `find_features` has it.
     """
     if len(images) < 3:
-        return find_features([images[0], *images], [recorded] * (len(images) + 1))
+        return find_features([images[0], *images], [recorded] * (len(images) + 1), tilted)
     still = np.median(np.stack(images), axis=0).astype(np.uint8)
     masks = [_moving(image, still) & (True if recorded is None else recorded) for image in images]
-    return find_features([still, *images], [recorded, *masks])
+    return find_features([still, *images], [recorded, *masks], tilted)
 
 
 def _moving(image: np.ndarray, still: np.ndarray) -> np.ndarray:
@@ -75,17 +78,25 @@ def _moving(image: np.ndarray, still: np.ndarray) -> np.ndarray:
     return np.asarray(cv2.dilate(moving, np.ones((9, 9)))) > 0
 
 
-def find_features(images: Sequence[np.ndarray], masks: Sequence[np.ndarray | None] | None = None) -> Features:
-    """Features of one camera's images RGB uint8 [H, W, 3], only where masks bool [H, W] are true."""
+def find_features(
+    images: Sequence[np.ndarray], masks: Sequence[np.ndarray | None] | None = None, tilted: bool = False
+) -> Features:
+    """Features of one camera's images RGB uint8 [H, W, 3], only where masks bool [H, W] are true.
+
+    `tilted` adds those of the first image as seen from aside: cameras 40 degrees apart share hardly any others.
+    """
     cv2 = opencv("calibrating from images", "calibration")
     masks = masks or [None] * len(images)
     parts = [
         sift_features(image, MOST_FEATURES, "calibrating from images", LEAST_CONTRAST, mask)
         for image, mask in zip(images, masks, strict=True)
     ]
+    moments = np.repeat(np.arange(len(images)), [len(part[0]) for part in parts])
+    if tilted:
+        more = sift_features(images[0], MOST_TILTED, "calibrating from images", LEAST_CONTRAST, masks[0], tilted=True)
+        parts, moments = [*parts, more], np.concatenate([moments, np.zeros(len(more[0]), int)])
     pixels, descriptors, shapes = (np.concatenate(part) for part in zip(*parts))
     roots = np.sqrt(descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-12))
-    moments = np.repeat(np.arange(len(images)), [len(part[0]) for part in parts])
     return Features(pixels, roots, moments, shapes, tuple(cv2.cvtColor(one, cv2.COLOR_RGB2GRAY) for one in images))
 
 
@@ -103,7 +114,7 @@ def _match(one: Features, other: Features) -> np.ndarray:
         # Unit vectors: the squared distance is 2 - 2 times the product.
         products = one.descriptors[rows] @ other.descriptors[columns].T
         best = products.argmax(axis=1)
-        two = -np.partition(-products, 1, axis=1)[:, :2]
+        two = np.partition(products, -2, axis=1)[:, [-1, -2]]
         near, second = (np.sqrt(np.maximum(2 - 2 * two[:, place], 0)) for place in (0, 1))
         mutual = products.argmax(axis=0)[best] == np.arange(len(rows))
         good = mutual & (near < RATIO * second)

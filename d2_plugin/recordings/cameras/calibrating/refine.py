@@ -29,13 +29,13 @@ from d2_plugin.recordings.cameras.calibrating.rig import aligned, differences
 from d2_plugin.recordings.cameras.calibrating.sharpen import sharpened
 from d2_plugin.recordings.cameras.epipolar import Matched, degrees_between, sampson, turned
 from d2_plugin.recordings.recording import Camera, Recording
-from d2_plugin.recordings.selection import downscale, spread
+from d2_plugin.recordings.selection import spread
 from d2_plugin.values import checked_arguments
 
 MOMENTS = 6  # frames that are read, spread over the recording
 TURNED = 0.15  # degrees by which a camera that is called wrong is turned: a quarter of a degree ruins stereo
 
-CHECKED = 960, 3  # pixels of the longer side at most, and moments, of images that poses are only held against
+CHECKED = 3  # moments of images that poses are only held against
 
 REACH = 0.04  # matches farther from where the given poses expect them are not believed, in diagonals of the image
 
@@ -103,18 +103,16 @@ def refine(recording: Recording, cameras: Sequence[str] | None = None, moments: 
 
 @checked_arguments
 def check_poses(recording: Recording) -> dict[str, Turn]:
-    """What smaller images of a few moments say about the orientation of each camera; none where they share too little.
+    """What images of a few moments say about the orientation of each camera; none where they share too little.
 
     Raises:
         D2Error: fewer than two cameras, or pycolmap or OpenCV is not installed.
     """
-    side = max(max(camera.width, camera.height) for camera in recording.cameras.values())
-    small = downscale(recording, -(-side // CHECKED[0]))
+    frames = spread(recording.frames, CHECKED)
     features = {
-        name: of_a_still_camera([small.image(name, frame) for frame in spread(small.frames, CHECKED[1])])
-        for name in small.cameras
+        name: of_a_still_camera([recording.image(name, frame) for frame in frames]) for name in recording.cameras
     }
-    return _turns(small.cameras, *_expected(small.cameras, features)[:2])[0]
+    return _turns(recording.cameras, *_expected(recording.cameras, features)[:2])[0]
 
 
 def turns_in_words(turns: Mapping[str, Turn], cameras: Collection[str]) -> list[str]:

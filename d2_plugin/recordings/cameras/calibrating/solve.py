@@ -84,8 +84,8 @@ def solve_rig(
     unknown = [name for name in (*images, *(stills or {})) if name not in intrinsics]
     if unknown or not images:
         raise D2Error(f"no intrinsics for camera {unknown[0] if unknown else 'any'}: give size and K of every camera")
-    features = {name: of_a_still_camera(_of_one_size(name, taken)) for name, taken in images.items()}
-    features |= {name: find_features([image]) for name, image in (stills or {}).items()}
+    features = {name: of_a_still_camera(_of_one_size(name, taken), tilted=True) for name, taken in images.items()}
+    features |= {name: find_features([image], tilted=True) for name, image in (stills or {}).items()}
     features, corners = (features, {}) if board is None else board_matches(features, images, board)
     return solve_features(features, intrinsics, tuple(images), corners, focal)
 
