@@ -39,9 +39,6 @@ class Yang4DSettings(SplatSettings):
 
     sh_time_degree: Annotated[int, Range(0, 8)] = 0
     """Number of cosines in time that modulate the colour; 0: constant in time."""
-    couples_time: bool = True
-    """False keeps time apart from space: one quaternion instead of two, and every Gaussian stands still while it lives
-    (the official code's rot_4d off)."""
 
 
 class Yang4D(SplatModel):
@@ -84,17 +81,14 @@ class Yang4D(SplatModel):
         return slice_gaussians(self._raw(), view.time)
 
     def _raw(self) -> dict[str, Tensor]:
-        parameters = self.gaussians.parameters
-        names = TEMPORAL if self.settings.temporal else STATIC
-        # Equal quaternions leave the time axis where it is: space turns, nothing moves.
-        return {name: parameters.get(name, parameters["left"]) for name in names}
+        return {name: self.gaussians[name] for name in (TEMPORAL if self.settings.temporal else STATIC)}
 
     def rotations(self, rows: Mapping[str, Tensor]) -> Tensor:
         """Rotation matrices of raw rows, [4, 4, K] or without time [3, 3, K]."""
         left = unit_quaternions(rows["left"])
         if "times" not in rows:
             return rotation_matrices_3d(left)
-        return rotation_matrices_4d(left, unit_quaternions(rows["right"]) if "right" in rows else left)
+        return rotation_matrices_4d(left, unit_quaternions(rows["right"]))
 
     def colors(self, view: View, splats: Splats) -> Tensor:
         """RGB [M, 3] of the sliced Gaussians as seen in `view`, at its time."""
@@ -130,8 +124,7 @@ def initial_rows(
     if settings.temporal:
         rows["times"] = times
         rows["log_time_scales"] = torch.full_like(scales, 0.5 * math.log(max(duration, 1e-12) / 5))
-        if settings.couples_time:
-            rows["right"] = rows["left"].clone()
+        rows["right"] = rows["left"].clone()
     return rows
 
 

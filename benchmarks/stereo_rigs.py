@@ -65,12 +65,12 @@ def _covisible(rig: Rig, index: int) -> np.ndarray:
         surface = rig.truths[other]
         if surface is None:
             surface = _nearest_surface(at.x, at.y, np.where(truth > 0, at.z, 0), source)
-        there = _nearest_depth(surface, at)
+        there = sample_nearest(surface, at)
         seen |= (truth > 0) & (np.abs(there - at.z) < OCCLUSION * at.z)
     return seen
 
 
-def _nearest_depth(depth: np.ndarray, at: Projection) -> np.ndarray:
+def sample_nearest(depth: np.ndarray, at: Projection) -> np.ndarray:
     """`depth` at the nearest pixel of `at`, 0 outside of the image or behind the camera.
 
     Nearest on purpose: a value interpolated across an occlusion edge belongs to no surface.

@@ -6,6 +6,7 @@ import contextlib
 import os
 import zlib  # noqa: F401  before pycolmap, whose own copy of zlib would otherwise be bound
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +41,14 @@ def shared_data() -> Callable[[str], Path]:
         return path
 
     return locate
+
+
+@pytest.fixture
+def refused(capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
+    """The sentence with which a command line is refused."""
+    import command_lines  # after the environment is set above
+
+    return partial(command_lines.refused, capsys)
 
 
 @pytest.fixture

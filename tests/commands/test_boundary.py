@@ -10,7 +10,6 @@ from concurrent.futures.process import BrokenProcessPool
 from functools import partial
 from pathlib import Path
 
-import command_lines
 import pytest
 from small_layouts import write_layout
 
@@ -23,12 +22,6 @@ from d2_plugin.errors import D2Error
 pytest.importorskip("cv2", reason="opencv is in the `image` extra")
 
 Refused = Callable[..., str]
-
-
-@pytest.fixture
-def refused(capsys: pytest.CaptureFixture[str]) -> Refused:
-    """The sentence with which a command line is refused."""
-    return partial(command_lines.refused, capsys)
 
 
 @pytest.fixture(scope="module")

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.stereo_rigs import sample_nearest
 from d2_plugin.priors.geometry import Projection, ViewPair, view_pair, viewing_rays
 from d2_plugin.priors.stereo.filtering.confirm import NUDGE, REPROJECTION_MAX
 from d2_plugin.priors.stereo.filtering.precision import (
@@ -123,18 +124,6 @@ def _meet(rays: np.ndarray, depth: np.ndarray, pair: ViewPair, settings: StereoS
     low, high = np.deg2rad(settings.min_angle), np.deg2rad(settings.max_angle)
     above = sine * np.float32(np.cos(low)) > cosine * np.float32(np.sin(low))
     return above & (sine * np.float32(np.cos(high)) < cosine * np.float32(np.sin(high)))
-
-
-def sample_nearest(depth: np.ndarray, at: Projection) -> np.ndarray:
-    """`depth` at the nearest pixel of `at`, 0 outside of the image or behind the camera.
-
-    Nearest on purpose: a value interpolated across an occlusion edge belongs to no surface.
-    """
-    height, width = depth.shape
-    inside = (at.z > 0) & (at.x > -0.5) & (at.y > -0.5) & (at.x < width - 0.5) & (at.y < height - 0.5)
-    column = np.rint(np.where(inside, at.x, 0)).astype(np.int32)
-    row = np.rint(np.where(inside, at.y, 0)).astype(np.int32)
-    return np.where(inside, depth[row, column], 0)
 
 
 def sample_surface(depth: np.ndarray, at: Projection) -> np.ndarray:

@@ -9,10 +9,8 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from functools import partial
 from pathlib import Path
 
-import command_lines
 import pytest
 from small_layouts import write_layout
 
@@ -30,11 +28,6 @@ from d2_plugin.store.store import PriorStore
 pytest.importorskip("cv2", reason="opencv is in the `image` extra")
 
 Refused = Callable[..., str]
-
-
-@pytest.fixture
-def refused(capsys: pytest.CaptureFixture[str]) -> Refused:
-    return partial(command_lines.refused, capsys)
 
 
 @pytest.fixture(scope="module")

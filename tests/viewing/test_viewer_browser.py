@@ -5,7 +5,6 @@ from __future__ import annotations
 import socket
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
@@ -13,6 +12,7 @@ import numpy as np
 import pytest
 from tiny import ALL_HOOKS, make_trainer
 from viewing.chromium import Page, browser, executable
+from viewing.showing import showing
 
 from d2_plugin.viewing.live import Viewer
 from d2_plugin.viewing.viewed import KeptImages, ViewedRun
@@ -29,20 +29,6 @@ def new_page() -> Iterator[Callable[[], Page]]:
     executable()
     with browser(640, 400) as new:
         yield new
-
-
-@contextmanager
-def showing(viewed: ViewedRun) -> Iterator[Viewer]:
-    """A viewer whose images are drawn by a thread of its own, as `d2 view` draws them in its only one."""
-    viewer, stop = Viewer(viewed=viewed, port=18080, height=180), threading.Event()
-    thread = threading.Thread(target=viewer.stay, args=(stop.is_set,))
-    thread.start()
-    try:
-        yield viewer
-    finally:
-        stop.set()
-        thread.join()
-        viewer.close()
 
 
 def opened(new_page: Callable[[], Page], viewer: Viewer) -> Page:
@@ -104,7 +90,7 @@ def choose(page: Page, label: str, option: str) -> None:
 def test_a_person_moves_camera_and_time_while_another_only_looks(
     new_page: Callable[[], Page], viewed: ViewedRun
 ) -> None:
-    with showing(viewed) as viewer:
+    with showing(viewed, 180) as viewer:
         one, two = opened(new_page, viewer), opened(new_page, viewer)
         first, other = settled(one), settled(two)
         assert viewer.clients == 2
@@ -129,7 +115,7 @@ def test_a_person_moves_camera_and_time_while_another_only_looks(
 
 @pytest.mark.slow
 def test_depth_opacity_and_the_prior_as_points(new_page: Callable[[], Page], viewed: ViewedRun) -> None:
-    with showing(viewed) as viewer:
+    with showing(viewed, 180) as viewer:
         page = opened(new_page, viewer)
         before = settled(page)
         for show in ("depth", "opacity"):
@@ -150,7 +136,7 @@ def test_names_stay_text_and_only_this_machine_may_look(new_page: Callable[[], P
     cameras = {EVIL if name == "train0" else name: camera for name, camera in viewed.recording.cameras.items()}
     recording = replace(viewed.recording, cameras=cameras, source=KeptImages(cameras))
     named = replace(viewed, name=EVIL, recording=recording, train_cameras=tuple(cameras), store=None, test_cameras=())
-    with showing(named) as viewer:
+    with showing(named, 180) as viewer:
         page = opened(new_page, viewer)
         settled(page)
         assert control(page, "shown").input_value() == EVIL

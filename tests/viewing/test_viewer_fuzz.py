@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import random
-import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 from socket import create_connection
 from typing import Any
 
 import pytest
 from fuzzing import SEED, mutated_bytes, mutated_value
+from viewing.showing import showing
 
 from d2_plugin.viewing.live import Viewer
 from d2_plugin.viewing.live.server import COOKIE
@@ -34,21 +34,6 @@ CAMERA = {
     "look_at": [0.0, 0.0, 1.0],
     "up_direction": [0.0, -1.0, 0.0],
 }
-
-
-@contextmanager
-def showing(viewed: ViewedRun) -> Iterator[Viewer]:
-    """A viewer whose images are drawn by a thread of its own."""
-    viewer, stop = Viewer(viewed=viewed, port=18080, height=48), threading.Event()
-    thread = threading.Thread(target=viewer.stay, args=(stop.is_set,))
-    thread.start()
-    try:
-        yield viewer
-        assert thread.is_alive(), "what draws has stopped"
-    finally:
-        stop.set()
-        thread.join()
-        viewer.close()
 
 
 def connected(viewer: Viewer) -> Any:
@@ -93,7 +78,7 @@ def messages_of(viewer: Viewer) -> list[dict[str, Any]]:
 def test_only_what_the_page_sends_comes_in(viewed: ViewedRun, monkeypatch: pytest.MonkeyPatch) -> None:
     shared: list[object] = []
     monkeypatch.setattr(viser.ViserServer, "request_share_url", lambda self: shared.append(self))
-    with showing(viewed) as viewer, connected(viewer) as socket:
+    with showing(viewed, 48) as viewer, connected(viewer) as socket:
         drawn(viewer, 1)
         [(page, _)] = viewer._pages.values()
         control = page.controls["opacity"]
@@ -116,7 +101,7 @@ def test_messages_at_random(
     caplog: pytest.LogCaptureFixture,
     recwarn: pytest.WarningsRecorder,
 ) -> None:
-    with showing(viewed) as viewer, connected(viewer) as looker:
+    with showing(viewed, 48) as viewer, connected(viewer) as looker:
         drawn(viewer, 1)
         for round in range(count // 50):
             attacker = connected(viewer)
@@ -148,7 +133,7 @@ def test_messages_at_random(
 def test_keyframes_come_and_go_while_the_path_is_asked_for(
     viewed: ViewedRun, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    with showing(viewed) as viewer, connected(viewer) as socket:
+    with showing(viewed, 48) as viewer, connected(viewer) as socket:
         drawn(viewer, 1)
         [(page, _)] = viewer._pages.values()
         buttons = {

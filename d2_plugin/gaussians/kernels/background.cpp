@@ -69,7 +69,10 @@ static void gather_row(const Background& b, const float* line, float* nodes) {
 }
 
 // A number for each pixel, as it stands beside its three colours.
-D2_INLINE void repeat(Floats values, Floats (&out)[3]) { weave<LANES>({values, values, values}, out); }
+D2_INLINE void repeat(Floats values, Floats (&out)[3]) {
+  const Floats all[3] = {values, values, values};
+  weave<LANES, 3>(all, out);
+}
 
 // One row of a strip: what the Gaussians leave of each ray shows what lies `low` of the way from `upper` to `lower`.
 static void composite(const float* upper, const float* lower, float low, const float* alpha, const float* in, int width,
@@ -103,7 +106,7 @@ static void split(const float* upper, const float* lower, float low, const float
       (Floats::load(to_lower + i) + down).store(to_lower + i);
       (Floats::load(to_upper + i) + (part - down)).store(to_upper + i);
     }
-    unweave<LANES>(products, colors);
+    unweave<LANES, 3>(products, colors);
     const Floats through = colors[0] + colors[1] + colors[2];
     (-through).store(on_alpha + x);
   }

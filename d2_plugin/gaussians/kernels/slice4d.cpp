@@ -7,7 +7,6 @@
 #include <cfloat>
 #include <cstdint>
 #include <cstring>
-#include <utility>
 #include <vector>
 
 #include "parallel.h"
@@ -50,55 +49,10 @@ struct Group {
   }
 };
 
-// LANES rows of K numbers fill K vectors, as the K columns do: lane i of column k is number i * K + k of the rows.
-// Where to find what in the two vectors that a shuffle joins, `next` being the second:
-template <int K, int k, int next>
-struct ToColumn {
-  static constexpr int at(int lane) {
-    const int from = lane * K + k, vector = from / LANES;
-    return vector == next ? LANES + from % LANES : next > 1 ? lane : from % LANES;
-  }
-};
-template <int K, int k, int next>
-struct FromColumn {
-  static constexpr int at(int lane) {
-    const int row = (k * LANES + lane) / K, column = (k * LANES + lane) % K;
-    return column == next ? LANES + row : next > 1 ? lane : row;
-  }
-};
-
-template <class Places, int... lane>
-D2_INLINE Native shuffle(Native a, Native b, std::integer_sequence<int, lane...>) {
-#if defined(__clang__)
-  return __builtin_shufflevector(a, b, Places::at(lane)...);
-#else
-  return __builtin_shuffle(a, b, Integers{Places::at(lane)...});
-#endif
-}
-
-template <template <int, int, int> class Places, int K, int k, int next = 1>
-D2_INLINE Native gather(const Floats* from, Native joined) {
-  if constexpr (next < K) {
-    const auto all = std::make_integer_sequence<int, LANES>();
-    return gather<Places, K, k, next + 1>(from, shuffle<Places<K, k, next>>(joined, from[next].v, all));
-  } else {
-    return joined;
-  }
-}
-
-template <template <int, int, int> class Places, int K, int k = 0>
-D2_INLINE void transpose(const Floats* from, Floats* to) {
-  if constexpr (k < K) {
-    to[k] = gather<Places, K, k>(from, from[0].v);
-    transpose<Places, K, k + 1>(from, to);
-  }
-}
-
 // Columns of an array [., K]; zeros where there is no array.
 template <int K>
 D2_INLINE void load(const Group& group, const float* array, Floats* columns) {
   alignas(64) float collected[LANES * K];
-  Floats packed[K];
   const float* from = collected;
   if (!array)
     std::fill(collected, collected + LANES * K, 0.f);
@@ -106,17 +60,14 @@ D2_INLINE void load(const Group& group, const float* array, Floats* columns) {
     from = array + K * group.row[0];
   else
     for (int i = 0; i < LANES; i++) std::memcpy(collected + K * i, array + K * group.row[i], sizeof(float) * K);
-  for (int k = 0; k < K; k++) packed[k] = Floats::load(from + LANES * k);
-  transpose<ToColumn, K>(packed, columns);
+  load_rows<K>(from, columns);
 }
 
 template <int K>
 D2_INLINE void store(const Group& group, const Floats* columns, float* array) {
   alignas(64) float collected[LANES * K];
-  Floats packed[K];
-  transpose<FromColumn, K>(columns, packed);
   float* to = group.together ? array + K * group.row[0] : collected;
-  for (int k = 0; k < K; k++) packed[k].store(to + LANES * k);
+  store_rows<K>(columns, to);
   if (group.together) return;
   for (int i = 0; i < group.count; i++) std::memcpy(array + K * group.row[i], collected + K * i, sizeof(float) * K);
 }

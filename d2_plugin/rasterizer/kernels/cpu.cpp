@@ -88,7 +88,7 @@ D2_INLINE void load_channels(const float* image, int channels, const Patch& p, V
   if (FIXED == 3 && WHOLE) {
     Floats woven[3], parts[3];
     for (int k = 0; k < 3; k++) woven[k] = load_block(image + 3 * p.pixel + k * BLOCK_WIDTH, 3 * int64_t(p.stride));
-    unweave<BLOCK_WIDTH>(woven, parts);
+    unweave<BLOCK_WIDTH, 3>(woven, parts);
     for (int c = 0; c < 3; c++) visit(c, parts[c]);
   } else {
     for (int c = 0; c < channels; c++) visit(c, load_part(image, channels, c, p));
@@ -98,8 +98,9 @@ D2_INLINE void load_channels(const float* image, int channels, const Patch& p, V
 template <int FIXED, bool WHOLE, class Value>
 D2_INLINE void store_channels(float* image, int channels, const Patch& p, Value value) {
   if (FIXED == 3 && WHOLE) {
+    const Floats parts[3] = {value(0), value(1), value(2)};
     Floats woven[3];
-    weave<BLOCK_WIDTH>({value(0), value(1), value(2)}, woven);
+    weave<BLOCK_WIDTH, 3>(parts, woven);
     for (int k = 0; k < 3; k++)
       store_block(woven[k], image + 3 * p.pixel + k * BLOCK_WIDTH, 3 * int64_t(p.stride));
   } else {

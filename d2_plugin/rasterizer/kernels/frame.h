@@ -153,12 +153,12 @@ D2_INLINE void store_column(Floats values, float* row, int64_t stride, int colum
 // All N columns of up to LANES rows.
 template <int N>
 D2_INLINE void load_columns(const float* row, int rows, Floats (&out)[N]) {
-  if (rows == LANES) return load_rows(row, out);
+  if (rows == LANES) return load_rows<N>(row, out);
   for (int n = 0; n < N; n++) out[n] = load_column(row, N, n, rows);
 }
 template <int N>
 D2_INLINE void store_columns(const Floats (&columns)[N], float* row, int rows) {
-  if (rows == LANES) return store_rows(columns, row);
+  if (rows == LANES) return store_rows<N>(columns, row);
   for (int n = 0; n < N; n++) store_column(columns[n], row, N, n, rows);
 }
 

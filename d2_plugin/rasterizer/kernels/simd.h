@@ -7,6 +7,7 @@
 
 #include <cstdint>
 #include <cstring>
+#include <utility>
 
 #if defined(__AVX512F__) && defined(__AVX512DQ__) && defined(__AVX512VL__)
 #define D2_AVX512 1
@@ -295,186 +296,106 @@ D2_INLINE void store_sums(const Floats* parts, float* out) {
 D2_INLINE void store_quad(const Floats* parts, float* out) { store_sums<4>(parts, out); }
 #endif
 
-// Lane i of a vector that is put together from others: lane from[i] % LANES of the vector from[i] / LANES.
-struct Choice {
-  alignas(64) int32_t from[LANES];
-};
-
-#if defined(D2_AVX512)
-D2_INLINE Floats pick(const Floats (&v)[2], const Choice& choice) {
-  return _mm512_permutex2var_ps(v[0].v, _mm512_load_si512(choice.from), v[1].v);
+// A vector put together from v: its lane i is lane Places::at(i) % LANES of vector Places::at(i) / LANES. One shuffle for
+// each vector after the first; what other shuffles put in place stays.
+template <class Places, int next>
+constexpr int lane_of_two(int lane) {
+  const int from = Places::at(lane);
+  return from / LANES == next ? LANES + from % LANES : next > 1 ? lane : from % LANES;
 }
-D2_INLINE Floats pick(const Floats (&v)[3], const Choice& choice) {
-  const __m512i from = _mm512_load_si512(choice.from);
-  const __mmask16 third = _mm512_test_epi32_mask(from, _mm512_set1_epi32(2 * LANES));
-  return _mm512_mask_permutexvar_ps(_mm512_permutex2var_ps(v[0].v, from, v[1].v), third, from, v[2].v);
-}
-#elif defined(D2_AVX2)
-D2_INLINE Floats pick(const Floats (&v)[2], const Choice& choice) {
-  const __m256i from = _mm256_load_si256(reinterpret_cast<const __m256i*>(choice.from));
-  const __m256 first = _mm256_permutevar8x32_ps(v[0].v, from), second = _mm256_permutevar8x32_ps(v[1].v, from);
-  return _mm256_blendv_ps(first, second, _mm256_castsi256_ps(_mm256_slli_epi32(from, 28)));  // by the bit of LANES
-}
-D2_INLINE Floats pick(const Floats (&v)[3], const Choice& choice) {
-  const __m256i from = _mm256_load_si256(reinterpret_cast<const __m256i*>(choice.from));
-  const Floats two = pick({v[0], v[1]}, choice), third = _mm256_permutevar8x32_ps(v[2].v, from);
-  return _mm256_blendv_ps(two.v, third.v, _mm256_castsi256_ps(_mm256_slli_epi32(from, 27)));
-}
+template <class Places, int next, int... lane>
+D2_INLINE Native shuffle(Native a, Native b, std::integer_sequence<int, lane...>) {
+#if defined(__clang__)
+  return __builtin_shufflevector(a, b, lane_of_two<Places, next>(lane)...);
 #else
-template <int N>
-D2_INLINE Floats pick(const Floats (&v)[N], const Choice& choice) {
-  Native out;
-  for (int i = 0; i < LANES; i++) out[i] = v[choice.from[i] / LANES].v[choice.from[i] % LANES];
-  return out;
-}
+  return __builtin_shuffle(a, b, Integers{lane_of_two<Places, next>(lane)...});
 #endif
+}
+template <class Places, int N, int next = 1>
+D2_INLINE Native pick(const Floats* v, Native joined) {
+  if constexpr (next < N) {
+    const auto all = std::make_integer_sequence<int, LANES>();
+    return pick<Places, N, next + 1>(v, shuffle<Places, next>(joined, v[next].v, all));
+  } else {
+    return joined;
+  }
+}
 
 // N vectors of one quantity each to and from vectors as memory holds them, in which the N quantities of a pixel or of a
-// row follow each other: GROUP of them in one piece of memory, LANES / GROUP such pieces in one vector.
-template <int N, int GROUP>
-struct Woven {
-  Choice apart[N], together[N];
-  static constexpr int lane(int piece, int place) { return place / GROUP * LANES + piece * GROUP + place % GROUP; }
-  constexpr Woven() : apart(), together() {
-    for (int piece = 0; piece < LANES / GROUP; piece++)
-      for (int item = 0; item < GROUP; item++)
-        for (int n = 0; n < N; n++) {
-          const int place = item * N + n, here = lane(piece, place), there = piece * GROUP + item;
-          apart[n].from[there] = here;
-          together[here / LANES].from[here % LANES] = n * LANES + there;
-        }
+// row follow each other: GROUP of them in one piece of memory, LANES / GROUP such pieces in one vector. With LANES as
+// GROUP, vector n holds number n of LANES rows of N.
+template <int GROUP, int N, int n>
+struct Apart {
+  static constexpr int at(int lane) {
+    const int place = lane % GROUP * N + n;
+    return place / GROUP * LANES + lane / GROUP * GROUP + place % GROUP;
   }
 };
-template <int N, int GROUP>
-static constexpr Woven<N, GROUP> WOVEN = Woven<N, GROUP>();
-template <int GROUP, int N>
-D2_INLINE void unweave(const Floats (&woven)[N], Floats (&out)[N]) {
-  for (int n = 0; n < N; n++) out[n] = pick(woven, WOVEN<N, GROUP>.apart[n]);
+template <int GROUP, int N, int n>
+struct Together {
+  static constexpr int at(int lane) {
+    const int place = n * GROUP + lane % GROUP;
+    return place % N * LANES + lane / GROUP * GROUP + place / N;
+  }
+};
+template <int GROUP, int N, int n = 0>
+D2_INLINE void unweave(const Floats* woven, Floats* out) {
+  out[n] = pick<Apart<GROUP, N, n>, N>(woven, woven[0].v);
+  if constexpr (n + 1 < N) unweave<GROUP, N, n + 1>(woven, out);
 }
-template <int GROUP, int N>
-D2_INLINE void weave(const Floats (&parts)[N], Floats (&woven)[N]) {
-  for (int n = 0; n < N; n++) woven[n] = pick(parts, WOVEN<N, GROUP>.together[n]);
+template <int GROUP, int N, int n = 0>
+D2_INLINE void weave(const Floats* parts, Floats* woven) {
+  woven[n] = pick<Together<GROUP, N, n>, N>(parts, parts[0].v);
+  if constexpr (n + 1 < N) weave<GROUP, N, n + 1>(parts, woven);
 }
 
 // LANES rows of N floats each, as N vectors: vector n holds number n of every row.
 template <int N>
-D2_INLINE void load_rows(const float* rows, Floats (&out)[N]) {
+D2_INLINE void load_rows(const float* rows, Floats* out) {
   Floats woven[N];
   for (int n = 0; n < N; n++) woven[n] = Floats::load(rows + n * LANES);
-  if constexpr (N == 1) {
-    out[0] = woven[0];
-  } else if constexpr (N < 4) {
-    unweave<LANES>(woven, out);
-  } else {
-    static_assert(N == 6, "2, 3 or twice 3 are unwoven");
-    Floats even[3], odd[3], half[3];
-    for (int n = 0; n < 3; n++) {
-      const Floats both[2] = {woven[2 * n], woven[2 * n + 1]};
-      even[n] = pick(both, WOVEN<2, LANES>.apart[0]), odd[n] = pick(both, WOVEN<2, LANES>.apart[1]);
-    }
-    unweave<LANES>(even, half);
-    for (int n = 0; n < 3; n++) out[2 * n] = half[n];
-    unweave<LANES>(odd, half);
-    for (int n = 0; n < 3; n++) out[2 * n + 1] = half[n];
-  }
+  unweave<LANES, N>(woven, out);
 }
 template <int N>
-D2_INLINE void store_rows(const Floats (&parts)[N], float* rows) {
+D2_INLINE void store_rows(const Floats* parts, float* rows) {
   Floats woven[N];
-  if constexpr (N == 1) {
-    woven[0] = parts[0];
-  } else if constexpr (N < 4) {
-    weave<LANES>(parts, woven);
-  } else {
-    static_assert(N == 6, "2, 3 or twice 3 are woven");
-    Floats even[3], odd[3];
-    weave<LANES>({parts[0], parts[2], parts[4]}, even);
-    weave<LANES>({parts[1], parts[3], parts[5]}, odd);
-    for (int n = 0; n < 3; n++) {
-      const Floats both[2] = {even[n], odd[n]};
-      woven[2 * n] = pick(both, WOVEN<2, LANES>.together[0]);
-      woven[2 * n + 1] = pick(both, WOVEN<2, LANES>.together[1]);
-    }
-  }
+  weave<LANES, N>(parts, woven);
   for (int n = 0; n < N; n++) woven[n].store(rows + n * LANES);
 }
 
-// Rows of LANES floats, `stride` apart, to and from LANES vectors: lane i of vector n is number n of row i.
-#if defined(D2_AVX512)
+// Lane i of vector n becomes lane n of vector i: blocks of `apart` lanes and vectors change places, smallest first.
+template <int apart, bool upper>
+struct Exchanged {
+  static constexpr int at(int lane) { return (lane & apart ? LANES : 0) + (lane & ~apart) + upper * apart; }
+};
+template <int apart = 1>
 D2_INLINE void transpose(Floats (&m)[LANES]) {
-  __m512 a[16], b[16];
-  for (int i = 0; i < 16; i += 2) {
-    a[i] = _mm512_unpacklo_ps(m[i].v, m[i + 1].v);
-    a[i + 1] = _mm512_unpackhi_ps(m[i].v, m[i + 1].v);
+  for (int i = 0; i < LANES; i++) {
+    if (i & apart) continue;
+    const Floats both[2] = {m[i], m[i + apart]};
+    m[i] = pick<Exchanged<apart, false>, 2>(both, both[0].v);
+    m[i + apart] = pick<Exchanged<apart, true>, 2>(both, both[0].v);
   }
-  for (int i = 0; i < 16; i += 4)
-    for (int k = 0; k < 2; k++) {
-      const __m512d x = _mm512_castps_pd(a[i + k]), y = _mm512_castps_pd(a[i + k + 2]);
-      b[i + 2 * k] = _mm512_castpd_ps(_mm512_unpacklo_pd(x, y));
-      b[i + 2 * k + 1] = _mm512_castpd_ps(_mm512_unpackhi_pd(x, y));
-    }
-  // b[4 q + k]: quarter p holds number 4 p + k of rows 4 q..4 q + 3.
-  for (int k = 0; k < 4; k++) {
-    const __m512 even_low = _mm512_shuffle_f32x4(b[k], b[4 + k], 0x88), odd_low = _mm512_shuffle_f32x4(b[k], b[4 + k], 0xdd);
-    const __m512 even_high = _mm512_shuffle_f32x4(b[8 + k], b[12 + k], 0x88);
-    const __m512 odd_high = _mm512_shuffle_f32x4(b[8 + k], b[12 + k], 0xdd);
-    m[k] = _mm512_shuffle_f32x4(even_low, even_high, 0x88), m[8 + k] = _mm512_shuffle_f32x4(even_low, even_high, 0xdd);
-    m[4 + k] = _mm512_shuffle_f32x4(odd_low, odd_high, 0x88), m[12 + k] = _mm512_shuffle_f32x4(odd_low, odd_high, 0xdd);
-  }
+  if constexpr (2 * apart < LANES) transpose<2 * apart>(m);
 }
-#elif defined(D2_AVX2)
-D2_INLINE void transpose(Floats (&m)[LANES]) {
-  __m256 a[8], b[8];
-  for (int i = 0; i < 8; i += 2) {
-    a[i] = _mm256_unpacklo_ps(m[i].v, m[i + 1].v);
-    a[i + 1] = _mm256_unpackhi_ps(m[i].v, m[i + 1].v);
-  }
-  for (int i = 0; i < 8; i += 4)
-    for (int k = 0; k < 2; k++) {
-      b[i + 2 * k] = _mm256_shuffle_ps(a[i + k], a[i + k + 2], 0x44);
-      b[i + 2 * k + 1] = _mm256_shuffle_ps(a[i + k], a[i + k + 2], 0xee);
-    }
-  // b[4 q + k]: half p holds number 4 p + k of rows 4 q..4 q + 3.
-  for (int k = 0; k < 4; k++) {
-    m[k] = _mm256_permute2f128_ps(b[k], b[4 + k], 0x20);
-    m[4 + k] = _mm256_permute2f128_ps(b[k], b[4 + k], 0x31);
-  }
-}
-#else
-D2_INLINE void transpose(Floats (&m)[LANES]) {
-  for (int i = 0; i < LANES; i++)
-    for (int j = i + 1; j < LANES; j++) {
-      const float kept = m[i].v[j];
-      m[i].v[j] = m[j].v[i], m[j].v[i] = kept;
-    }
-}
-#endif
 
 // A block of pixels from and to an image whose rows are `stride` floats apart.
-#if defined(D2_AVX512)
 D2_INLINE Floats load_block(const float* from, int64_t stride) {
+#if defined(D2_AVX512)  // put together in memory, a vector waits for its parts to be written
   const __m256 low = _mm256_insertf128_ps(_mm256_castps128_ps256(_mm_loadu_ps(from)), _mm_loadu_ps(from + stride), 1);
   const float* below = from + 2 * stride;
   const __m256 high = _mm256_insertf128_ps(_mm256_castps128_ps256(_mm_loadu_ps(below)), _mm_loadu_ps(below + stride), 1);
   return _mm512_insertf32x8(_mm512_castps256_ps512(low), high, 1);
-}
-D2_INLINE void store_block(Floats block, float* to, int64_t stride) {
-  _mm_storeu_ps(to, _mm512_castps512_ps128(block.v));
-  _mm_storeu_ps(to + stride, _mm512_extractf32x4_ps(block.v, 1));
-  _mm_storeu_ps(to + 2 * stride, _mm512_extractf32x4_ps(block.v, 2));
-  _mm_storeu_ps(to + 3 * stride, _mm512_extractf32x4_ps(block.v, 3));
-}
 #else
-D2_INLINE Floats load_block(const float* from, int64_t stride) {
   Floats out;
   for (int y = 0; y < BLOCK_HEIGHT; y++)
     std::memcpy(reinterpret_cast<char*>(&out.v) + 4 * y * BLOCK_WIDTH, from + y * stride, 4 * BLOCK_WIDTH);
   return out;
+#endif
 }
 D2_INLINE void store_block(Floats block, float* to, int64_t stride) {
   for (int y = 0; y < BLOCK_HEIGHT; y++)
     std::memcpy(to + y * stride, reinterpret_cast<const char*>(&block.v) + 4 * y * BLOCK_WIDTH, 4 * BLOCK_WIDTH);
 }
-#endif
 
 }  // namespace d2
