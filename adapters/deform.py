@@ -37,7 +37,10 @@ class DeformAdapter(WatchedModel[Deform]):
             offsets = self.model.offsets(inversion.positions[chosen], time)
             if offsets is not None:
                 scales[chosen] *= torch.exp(-offsets.log_scales.mean(-1))
-        rows = initial_rows(inversion.positions, points.colors, scales, points.opacities, self.model.settings)
+        placed = points._replace(positions=inversion.positions, scales=scales)
+        rows = initial_rows(*placed[:5], self.model.settings, self.model.duration)
+        if points.lifetimes is not None and "log_time_scales" in rows:
+            rows["log_time_scales"] = torch.minimum(rows["log_time_scales"], points.lifetimes.log())
         self.model.append(rows)
         self.proposed += len(inversion.accepted)
         self.accepted += int(inversion.accepted.sum())

@@ -17,9 +17,9 @@ from torch import Tensor
 
 from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.moving import MovingGaussians, moving_gaussians
-from d2_plugin.gaussians.native_slice import STATIC
-from d2_plugin.gaussians.rotation4d import rotation_matrices_3d, unit_quaternions
-from d2_plugin.gaussians.slicing import slice_gaussians
+from d2_plugin.gaussians.native_slice import STATIC, TEMPORAL
+from d2_plugin.gaussians.rotation4d import rotation_matrices_3d, temporal_marginal, unit_quaternions
+from d2_plugin.gaussians.slicing import LOG_SCALE_LIMIT, MARGINAL_CUT, rows_to_draw, slice_gaussians
 from d2_plugin.rasterizer import Splats, View
 from d2_plugin.settings import Seed, Share
 
@@ -34,6 +34,9 @@ __all__ = ["Deform", "DeformSettings", "TrainSettings", "Trainer", "create", "in
 TIME_NOISE = 5e-3
 """Standard deviation of the noise on a training step's time at the first step, as a share of the duration; it falls to
 zero at half of the run. Official: a tenth of the frame interval, in real scenes."""
+LASTING = 10.0
+"""Temporal standard deviation of a Gaussian at the start, in durations: it exists at all instants."""
+TIME_RATE = 1.6e-3
 FIELD_DECAY = 0.1
 """Learning rates of the field at the last step, as a share of the first; exponential in between."""
 
@@ -46,6 +49,8 @@ class DeformSettings(SplatSettings):
     """Kind of the deformation field."""
     warm_up: Share = 0.075
     """Share of the run without deformation: the canonical Gaussians settle first. Official: 3000 of 40000 steps."""
+    existence: bool = True
+    """Whether a Gaussian has an instant and a lifetime, as in SpacetimeGaussians: it fades away from its instant."""
     seed: Seed = 0
     """Seed of the field's start and of the noise on time; the global random state is never used."""
     mlp: MlpSettings = dataclasses.field(default_factory=MlpSettings)
@@ -65,9 +70,13 @@ class Deform(SplatModel):
     def __init__(
         self, rows: Mapping[str, Tensor], settings: DeformSettings, extent: float, duration: float, box: Box
     ) -> None:
-        rates = shared_rates(settings, extent) | {"rotations": ROTATION_RATE}
-        super().__init__(rows, rates, settings, extent)
         self.duration = max(duration, 1e-12)
+        rates = shared_rates(settings, extent) | {
+            "rotations": ROTATION_RATE,
+            "times": TIME_RATE * self.duration,
+            "log_time_scales": settings.scale_rate,
+        }
+        super().__init__(rows, rates, settings, extent)
         self._generator = torch.Generator().manual_seed(settings.seed)
         self.field: Field | None = None
         self.deforms = False
@@ -79,12 +88,12 @@ class Deform(SplatModel):
 
     @classmethod
     def from_points(
-        cls, positions: Tensor, colors: Tensor, settings: DeformSettings, extent: float, duration: float
+        cls, positions: Tensor, colors: Tensor, times: Tensor, settings: DeformSettings, extent: float, duration: float
     ) -> Deform:
-        """A model that starts at coloured points of any times: positions [N, 3] world, colors [N, 3] in 0..1."""
+        """A model that starts at coloured points: positions [N, 3] world, colors [N, 3] in 0..1, times [N]."""
         scales = nearest_neighbour_scales(positions).clamp(max=0.1 * extent)
         opacities = torch.full_like(scales, INITIAL_OPACITY)
-        rows = initial_rows(positions, colors, scales, opacities, settings)
+        rows = initial_rows(positions, colors, times, scales, opacities, settings, duration)
         return cls(rows, settings, extent, duration, Box.around(positions, extent))
 
     def slice_at(self, view: View) -> Splats:
@@ -97,18 +106,34 @@ class Deform(SplatModel):
         """
         if self.field is not None and math.isnan(view.time):
             raise D2Error(f"the time of camera '{view.camera}', frame {view.frame} is NaN: give every view a time")
-        raw = self._canonical()
+        raw, time = self._canonical(), min(max(view.time, 0.0), self.duration)
+        rows = self._living(time)
+        raw = raw if rows is None else {name: value.index_select(0, rows) for name, value in raw.items()}
         noise = self._noise if torch.is_grad_enabled() else 0.0
         offsets = self.offsets(raw["positions"], view.time + noise)
         if offsets is not None:
             raw["positions"] = raw["positions"] + offsets.positions
             raw["log_scales"] = raw["log_scales"] + offsets.log_scales
             raw["left"] = raw["left"] + offsets.rotations
-        return slice_gaussians(raw)
+        if "times" in raw:
+            raw["right"] = raw["left"]
+        splats = slice_gaussians(raw, time)
+        return splats if rows is None else splats._replace(rows=rows[splats.rows])
+
+    @torch.no_grad()
+    def _living(self, time: float) -> Tensor | None:
+        """Rows of the Gaussians that are drawn at a time: the field costs more than all else, and is evaluated there
+        alone. None for all."""
+        if "times" not in self.gaussians.parameters:
+            return None
+        lifetimes = self.gaussians["log_time_scales"].clamp(-LOG_SCALE_LIMIT, LOG_SCALE_LIMIT).exp()
+        marginal = temporal_marginal(time - self.gaussians["times"], lifetimes.square())
+        return rows_to_draw(marginal > MARGINAL_CUT)
 
     def _canonical(self) -> dict[str, Tensor]:
-        g = self.gaussians
-        return {name: g["rotations" if name == "left" else name] for name in STATIC}
+        parameters = self.gaussians.parameters
+        names = TEMPORAL if "times" in parameters else STATIC
+        return {name: parameters.get(name, parameters["rotations"]) for name in names}
 
     def moving(self) -> MovingGaussians | None:
         """See `SplatModel.moving`: only while nothing is deformed."""
@@ -173,11 +198,21 @@ def make_field(settings: DeformSettings, box: Box, generator: torch.Generator) -
 
 
 def initial_rows(
-    positions: Tensor, colors: Tensor, scales: Tensor, opacities: Tensor, settings: DeformSettings
+    positions: Tensor,
+    colors: Tensor,
+    times: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    settings: DeformSettings,
+    duration: float,
 ) -> dict[str, Tensor]:
-    """Raw rows of isotropic canonical Gaussians: positions [K, 3], colors [K, 3], scales [K], opacities [K]."""
+    """Raw rows of isotropic canonical Gaussians: positions [K, 3], colors [K, 3], times, scales, opacities [K]."""
     rows = isotropic_rows(positions, colors, scales, opacities, settings.sh_degree)
-    return rows | {"rotations": identity_quaternions(len(positions), positions)}
+    rows["rotations"] = identity_quaternions(len(positions), positions)
+    if settings.temporal and settings.existence:
+        rows["times"] = times
+        rows["log_time_scales"] = torch.full_like(scales, math.log(LASTING * max(duration, 1e-12)))
+    return rows
 
 
 def settings_from(table: Mapping[str, Any], temporal: bool = True) -> DeformSettings:
@@ -204,4 +239,4 @@ def create(
 
     `times` is not used: the points of all instants are canonical, as in both official codes.
     """
-    return Deform.from_points(positions, colors, settings_from(settings or {}, temporal), extent, duration)
+    return Deform.from_points(positions, colors, times, settings_from(settings or {}, temporal), extent, duration)

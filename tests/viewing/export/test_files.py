@@ -66,7 +66,7 @@ class TestStraightLines:
         model = sharp_model("hexplane")
         assert model.moving() is None
         model.deforms = False
-        assert model.moving().motion is None
+        assert not model.moving().motion.velocities.any()
 
     def test_a_factor_is_the_square_root_of_its_covariance(self) -> None:
         covariances = sharp_model("yang4d").moving().covariances
