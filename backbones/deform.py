@@ -17,7 +17,7 @@ from torch import Tensor
 
 from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.moving import MovingGaussians, moving_gaussians
-from d2_plugin.gaussians.native_slice import STATIC, TEMPORAL
+from d2_plugin.gaussians.native_slice import STATIC
 from d2_plugin.gaussians.rotation4d import rotation_matrices_3d, temporal_marginal, unit_quaternions
 from d2_plugin.gaussians.slicing import LOG_SCALE_LIMIT, MARGINAL_CUT, rows_to_draw, slice_gaussians
 from d2_plugin.rasterizer import Splats, View
@@ -106,39 +106,35 @@ class Deform(SplatModel):
         """
         if self.field is not None and math.isnan(view.time):
             raise D2Error(f"the time of camera '{view.camera}', frame {view.frame} is NaN: give every view a time")
-        raw, time = self._canonical(), min(max(view.time, 0.0), self.duration)
-        rows = self._living(time)
-        raw = raw if rows is None else {name: value.index_select(0, rows) for name, value in raw.items()}
+        raw, lives = self._canonical(), None
+        if "times" in self.gaussians.parameters:
+            rows, lives = self._living(min(max(view.time, 0.0), self.duration))
+            raw = {name: value[rows] for name, value in raw.items()}
         noise = self._noise if torch.is_grad_enabled() else 0.0
         offsets = self.offsets(raw["positions"], view.time + noise)
         if offsets is not None:
             raw["positions"] = raw["positions"] + offsets.positions
             raw["log_scales"] = raw["log_scales"] + offsets.log_scales
             raw["left"] = raw["left"] + offsets.rotations
-        if "times" in raw:
-            raw["right"] = raw["left"]
-        splats = slice_gaussians(raw, time)
-        return splats if rows is None else splats._replace(rows=rows[splats.rows])
+        splats = slice_gaussians(raw)
+        return splats if lives is None else splats._replace(opacities=splats.opacities * lives, rows=rows)
 
-    @torch.no_grad()
-    def _living(self, time: float) -> Tensor | None:
-        """Rows of the Gaussians that are drawn at a time: the field costs more than all else, and is evaluated there
-        alone. None for all."""
-        if "times" not in self.gaussians.parameters:
-            return None
-        lifetimes = self.gaussians["log_time_scales"].clamp(-LOG_SCALE_LIMIT, LOG_SCALE_LIMIT).exp()
-        marginal = temporal_marginal(time - self.gaussians["times"], lifetimes.square())
-        return rows_to_draw(marginal > MARGINAL_CUT)
+    def _living(self, time: float) -> tuple[Tensor, Tensor]:
+        """Rows [M] of the Gaussians that exist at a time, for which alone the field is evaluated, and F(t) [M]."""
+        variances = (2 * self.gaussians["log_time_scales"].clamp(-LOG_SCALE_LIMIT, LOG_SCALE_LIMIT)).exp()
+        offset = time - self.gaussians["times"]
+        alive = temporal_marginal(offset, variances).detach() > MARGINAL_CUT
+        rows = rows_to_draw(alive)
+        marginal = temporal_marginal(torch.where(alive, offset, 0.0), variances) * alive  # no gradient is 0 * inf
+        return rows, marginal[rows]
 
     def _canonical(self) -> dict[str, Tensor]:
-        parameters = self.gaussians.parameters
-        names = TEMPORAL if "times" in parameters else STATIC
-        return {name: parameters.get(name, parameters["rotations"]) for name in names}
+        g = self.gaussians
+        return {name: g["rotations" if name == "left" else name] for name in STATIC}
 
     def moving(self) -> MovingGaussians | None:
-        """See `SplatModel.moving`: only while nothing is deformed."""
-        still = self.field is None or not self.deforms
-        return moving_gaussians(self._canonical(), self.harmonics()) if still else None
+        """See `SplatModel.moving`: only without time."""
+        return moving_gaussians(self._canonical(), self.harmonics()) if self.field is None else None
 
     def offsets(self, positions: Tensor, time: float) -> Offsets | None:
         """What the field adds at canonical `positions` [K, 3]; None where nothing is deformed (warm-up, no time)."""
