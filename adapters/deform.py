@@ -7,7 +7,7 @@ import logging
 import torch
 from torch import Tensor
 
-from d2_plugin.backbones.deform import Deform, initial_rows
+from d2_plugin.backbones.deform import Deform
 from d2_plugin.protocol import Points
 
 from .inverse_deformation import invert_at_times
@@ -37,15 +37,10 @@ class DeformAdapter(WatchedModel[Deform]):
             offsets = self.model.offsets(inversion.positions[chosen], time)
             if offsets is not None:
                 scales[chosen] *= torch.exp(-offsets.log_scales.mean(-1))
-        placed = points._replace(positions=inversion.positions, scales=scales)
-        rows = initial_rows(*placed[:5], self.model.settings, self.model.duration)
-        if points.lifetimes is not None and "log_time_scales" in rows:
-            rows["log_time_scales"] = torch.minimum(rows["log_time_scales"], points.lifetimes.log())
-        self.model.append(rows)
         self.proposed += len(inversion.accepted)
         self.accepted += int(inversion.accepted.sum())
         logger.info("inverse deformation placed %d of %d points within tolerance so far", self.accepted, self.proposed)
-        return len(inversion.positions)
+        return super().insert(points._replace(positions=inversion.positions, scales=scales))
 
     def _deformed(self, positions: Tensor, time: float) -> Tensor:
         offsets = self.model.offsets(positions, time)

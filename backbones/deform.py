@@ -24,11 +24,11 @@ from d2_plugin.rasterizer import Splats, View
 from d2_plugin.settings import Seed, Share
 
 from .deform_fields import Box, Field, HexPlaneField, HexPlaneSettings, MlpField, MlpSettings, Offsets
-from .model import INITIAL_OPACITY, ROTATION_RATE, SplatModel, SplatSettings, decayed_rate, shared_rates
-from .starting import identity_quaternions, isotropic_rows, nearest_neighbour_scales, refuse_temporal
+from .model import SplatModel, SplatSettings, decayed_rate
+from .starting import identity_quaternions, isotropic_rows, refuse_temporal
 from .trainer import Trainer, TrainSettings
 
-__all__ = ["Deform", "DeformSettings", "TrainSettings", "Trainer", "create", "initial_rows", "settings_from"]
+__all__ = ["Deform", "DeformSettings", "TrainSettings", "Trainer", "create", "settings_from"]
 
 
 TIME_NOISE = 5e-3
@@ -36,7 +36,6 @@ TIME_NOISE = 5e-3
 zero at half of the run. Official: a tenth of the frame interval, in real scenes."""
 LASTING = 10.0
 """Temporal standard deviation of a Gaussian at the start, in durations: it exists at all instants."""
-TIME_RATE = 1.6e-3
 FIELD_DECAY = 0.1
 """Learning rates of the field at the last step, as a share of the first; exponential in between."""
 
@@ -45,12 +44,10 @@ FIELD_DECAY = 0.1
 class DeformSettings(SplatSettings):
     """Model and optimizers of the backbone."""
 
-    field: Literal["mlp", "hexplane"] = "mlp"
+    field: Literal["mlp", "hexplane"] = "hexplane"
     """Kind of the deformation field."""
     warm_up: Share = 0.075
     """Share of the run without deformation: the canonical Gaussians settle first. Official: 3000 of 40000 steps."""
-    existence: bool = True
-    """Whether a Gaussian has an instant and a lifetime, as in SpacetimeGaussians: it fades away from its instant."""
     seed: Seed = 0
     """Seed of the field's start and of the noise on time; the global random state is never used."""
     mlp: MlpSettings = dataclasses.field(default_factory=MlpSettings)
@@ -62,39 +59,42 @@ class DeformSettings(SplatSettings):
 class Deform(SplatModel):
     """N canonical Gaussians, their field, and an optimizer for each.
 
-    Parameters (raw) beside those of `SplatModel`: rotations [N, 4]. All Gaussians exist at all times.
+    Parameters (raw) beside those of `SplatModel`: rotations [N, 4], and with time: times [N], log_time_scales [N]. As
+    in SpacetimeGaussians (Li et al. 2024) a Gaussian fades away from its instant, o F(t); it starts to exist at all
+    times, unless it is inserted with a lifetime.
     """
 
     settings: DeformSettings
 
-    def __init__(
-        self, rows: Mapping[str, Tensor], settings: DeformSettings, extent: float, duration: float, box: Box
-    ) -> None:
-        self.duration = max(duration, 1e-12)
-        rates = shared_rates(settings, extent) | {
-            "rotations": ROTATION_RATE,
-            "times": TIME_RATE * self.duration,
-            "log_time_scales": settings.scale_rate,
-        }
-        super().__init__(rows, rates, settings, extent)
+    def __init__(self, rows: Mapping[str, Tensor], settings: DeformSettings, extent: float, duration: float) -> None:
+        super().__init__(rows, settings, extent, duration)
         self._generator = torch.Generator().manual_seed(settings.seed)
         self.field: Field | None = None
         self.deforms = False
         self._noise = 0.0
         if settings.temporal:
+            box = Box.around(rows["positions"], extent)
             self.field = make_field(settings, box, self._generator).to(rows["positions"])
             self.field_optimizer = torch.optim.Adam(self.field.parameter_groups(), eps=1e-15, fused=True)
             self.deforms = settings.warm_up <= 0
 
-    @classmethod
-    def from_points(
-        cls, positions: Tensor, colors: Tensor, times: Tensor, settings: DeformSettings, extent: float, duration: float
-    ) -> Deform:
-        """A model that starts at coloured points: positions [N, 3] world, colors [N, 3] in 0..1, times [N]."""
-        scales = nearest_neighbour_scales(positions).clamp(max=0.1 * extent)
-        opacities = torch.full_like(scales, INITIAL_OPACITY)
-        rows = initial_rows(positions, colors, times, scales, opacities, settings, duration)
-        return cls(rows, settings, extent, duration, Box.around(positions, extent))
+    @staticmethod
+    def initial_rows(
+        positions: Tensor,
+        colors: Tensor,
+        times: Tensor,
+        scales: Tensor,
+        opacities: Tensor,
+        settings: DeformSettings,
+        duration: float,
+    ) -> dict[str, Tensor]:
+        """See `SplatModel.initial_rows`; they exist at all times."""
+        rows = isotropic_rows(positions, colors, scales, opacities, settings.sh_degree)
+        rows["rotations"] = identity_quaternions(len(positions), positions)
+        if settings.temporal:
+            rows["times"] = times
+            rows["log_time_scales"] = torch.full_like(scales, math.log(LASTING * max(duration, 1e-12)))
+        return rows
 
     def slice_at(self, view: View) -> Splats:
         """The 3D Gaussians at `view.time`, differentiable; a time outside the scene shows its first or last instant.
@@ -107,7 +107,7 @@ class Deform(SplatModel):
         if self.field is not None and math.isnan(view.time):
             raise D2Error(f"the time of camera '{view.camera}', frame {view.frame} is NaN: give every view a time")
         raw, lives = self._canonical(), None
-        if "times" in self.gaussians.parameters:
+        if self.field is not None:
             rows, lives = self._living(min(max(view.time, 0.0), self.duration))
             raw = {name: value[rows] for name, value in raw.items()}
         noise = self._noise if torch.is_grad_enabled() else 0.0
@@ -193,24 +193,6 @@ def make_field(settings: DeformSettings, box: Box, generator: torch.Generator) -
     return HexPlaneField(box, settings.hexplane, generator)
 
 
-def initial_rows(
-    positions: Tensor,
-    colors: Tensor,
-    times: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    settings: DeformSettings,
-    duration: float,
-) -> dict[str, Tensor]:
-    """Raw rows of isotropic canonical Gaussians: positions [K, 3], colors [K, 3], times, scales, opacities [K]."""
-    rows = isotropic_rows(positions, colors, scales, opacities, settings.sh_degree)
-    rows["rotations"] = identity_quaternions(len(positions), positions)
-    if settings.temporal and settings.existence:
-        rows["times"] = times
-        rows["log_time_scales"] = torch.full_like(scales, math.log(LASTING * max(duration, 1e-12)))
-    return rows
-
-
 def settings_from(table: Mapping[str, Any], temporal: bool = True) -> DeformSettings:
     """`DeformSettings` from a plain table with tables "mlp", "hexplane", "densify" and "raster" inside.
 
@@ -231,8 +213,5 @@ def create(
     temporal: bool,
     settings: Mapping[str, Any] | None = None,
 ) -> Deform:
-    """The entry point `d2_plugin.backbones`: a model from points, with plain `settings` over the defaults.
-
-    `times` is not used: the points of all instants are canonical, as in both official codes.
-    """
+    """The entry point `d2_plugin.backbones`: a model from points, with plain `settings` over the defaults."""
     return Deform.from_points(positions, colors, times, settings_from(settings or {}, temporal), extent, duration)

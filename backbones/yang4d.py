@@ -22,15 +22,11 @@ from d2_plugin.gaussians.slicing import slice_gaussians
 from d2_plugin.rasterizer import Splats, View
 from d2_plugin.settings import Range
 
-from .model import INITIAL_OPACITY, ROTATION_RATE, SplatModel, SplatSettings, shared_rates
-from .starting import identity_quaternions, isotropic_rows, nearest_neighbour_scales, refuse_temporal
+from .model import SplatModel, SplatSettings
+from .starting import identity_quaternions, isotropic_rows, refuse_temporal
 from .trainer import Trainer, TrainSettings
 
-__all__ = ["TrainSettings", "Trainer", "Yang4D", "Yang4DSettings", "create", "initial_rows", "settings_from"]
-
-
-TIME_RATE = 1.6e-3
-"""Learning rate of mean times, relative to the duration."""
+__all__ = ["TrainSettings", "Trainer", "Yang4D", "Yang4DSettings", "create", "settings_from"]
 
 
 @dataclass(frozen=True)
@@ -53,25 +49,29 @@ class Yang4D(SplatModel):
 
     settings: Yang4DSettings
 
-    def __init__(self, rows: Mapping[str, Tensor], settings: Yang4DSettings, extent: float, duration: float) -> None:
-        self.duration = max(duration, 1e-12)
-        rates = shared_rates(settings, extent) | {
-            "times": TIME_RATE * self.duration,
-            "log_time_scales": settings.scale_rate,
-            "left": ROTATION_RATE,
-            "right": ROTATION_RATE,
-        }
-        super().__init__(rows, rates, settings, extent)
+    @staticmethod
+    def initial_rows(
+        positions: Tensor,
+        colors: Tensor,
+        times: Tensor,
+        scales: Tensor,
+        opacities: Tensor,
+        settings: Yang4DSettings,
+        duration: float,
+    ) -> dict[str, Tensor]:
+        """See `SplatModel.initial_rows`.
 
-    @classmethod
-    def from_points(
-        cls, positions: Tensor, colors: Tensor, times: Tensor, settings: Yang4DSettings, extent: float, duration: float
-    ) -> Yang4D:
-        """A model that starts at coloured points: positions [N, 3] world, colors [N, 3] in 0..1, times [N]."""
-        scales = nearest_neighbour_scales(positions).clamp(max=0.1 * extent)
-        opacities = torch.full_like(scales, INITIAL_OPACITY)
-        rows = initial_rows(positions, colors, times, scales, opacities, settings, duration)
-        return cls(rows, settings, extent, duration)
+        Rotations start at the identity and the temporal standard deviation at sqrt(duration / 5), as in the official
+        code (a variance of a fifth of the duration, gaussian_model.py:280).
+        """
+        rows = isotropic_rows(positions, colors, scales, opacities, settings.sh_degree, _time_degree(settings))
+        rows["left"] = identity_quaternions(len(positions), positions)
+        if settings.temporal:
+            rows["times"] = times
+            rows["log_time_scales"] = torch.full_like(scales, 0.5 * math.log(max(duration, 1e-12) / 5))
+            if settings.couples_time:
+                rows["right"] = rows["left"].clone()
+        return rows
 
     def slice_at(self, view: View) -> Splats:
         """The 3D Gaussians at `view.time`, differentiable.
@@ -109,30 +109,6 @@ class Yang4D(SplatModel):
     def moving(self) -> MovingGaussians:
         """See `SplatModel.moving`: every Gaussian of this model is of that form."""
         return moving_gaussians(self._raw(), self.harmonics())
-
-
-def initial_rows(
-    positions: Tensor,
-    colors: Tensor,
-    times: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    settings: Yang4DSettings,
-    duration: float,
-) -> dict[str, Tensor]:
-    """Raw rows of isotropic Gaussians: positions [K, 3], colors [K, 3], times [K], scales [K], opacities [K].
-
-    Rotations start at the identity and the temporal standard deviation at sqrt(duration / 5), as in the official
-    code (a variance of a fifth of the duration, gaussian_model.py:280).
-    """
-    rows = isotropic_rows(positions, colors, scales, opacities, settings.sh_degree, _time_degree(settings))
-    rows["left"] = identity_quaternions(len(positions), positions)
-    if settings.temporal:
-        rows["times"] = times
-        rows["log_time_scales"] = torch.full_like(scales, 0.5 * math.log(max(duration, 1e-12) / 5))
-        if settings.couples_time:
-            rows["right"] = rows["left"].clone()
-    return rows
 
 
 def _time_degree(settings: Yang4DSettings) -> int:
