@@ -25,7 +25,7 @@ from d2_plugin.settings import Seed, Share
 
 from .deform_fields import Box, Field, HexPlaneField, HexPlaneSettings, MlpField, MlpSettings, Offsets
 from .model import SplatModel, SplatSettings, decayed_rate
-from .starting import identity_quaternions, isotropic_rows, refuse_temporal
+from .starting import identity_quaternions, isotropic_rows
 from .trainer import Trainer, TrainSettings
 
 __all__ = ["Deform", "DeformSettings", "TrainSettings", "Trainer", "create", "settings_from"]
@@ -65,6 +65,7 @@ class Deform(SplatModel):
     """
 
     settings: DeformSettings
+    settings_kind = DeformSettings
 
     def __init__(self, rows: Mapping[str, Tensor], settings: DeformSettings, extent: float, duration: float) -> None:
         super().__init__(rows, settings, extent, duration)
@@ -193,25 +194,4 @@ def make_field(settings: DeformSettings, box: Box, generator: torch.Generator) -
     return HexPlaneField(box, settings.hexplane, generator)
 
 
-def settings_from(table: Mapping[str, Any], temporal: bool = True) -> DeformSettings:
-    """`DeformSettings` from a plain table with tables "mlp", "hexplane", "densify" and "raster" inside.
-
-    Raises:
-        D2Error: an unknown name; a value of the wrong type or out of range.
-    """
-    chosen = DeformSettings.from_dict(refuse_temporal(table), "backbone")
-    return dataclasses.replace(chosen, temporal=temporal)
-
-
-def create(
-    positions: Tensor,
-    colors: Tensor,
-    times: Tensor,
-    *,
-    extent: float,
-    duration: float,
-    temporal: bool,
-    settings: Mapping[str, Any] | None = None,
-) -> Deform:
-    """The entry point `d2_plugin.backbones`: a model from points, with plain `settings` over the defaults."""
-    return Deform.from_points(positions, colors, times, settings_from(settings or {}, temporal), extent, duration)
+create, settings_from = Deform.create, Deform.settings_from

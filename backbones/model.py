@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, TypeVar
 
 import numpy as np
@@ -88,6 +88,8 @@ class SplatModel(ABC):
     base_colors [N, 1, 3], and where asked for harmonics [N, C - 1, 3].
     """
 
+    settings_kind: type[SplatSettings]
+
     def __init__(self, rows: Mapping[str, Tensor], settings: SplatSettings, extent: float, duration: float) -> None:
         self.settings, self.extent, self.duration = settings, extent, max(duration, 1e-12)
         rates = learning_rates(settings, extent, self.duration)
@@ -98,6 +100,35 @@ class SplatModel(ABC):
         self.observers: list[Observer] = []
         self.screen_offsets: Tensor | None = None
         self._drawn: Tensor | None = None
+
+    @classmethod
+    def settings_from(cls, table: Mapping[str, Any], temporal: bool = True) -> Any:
+        """Settings of the backbone, a `settings_kind`, from a plain table with tables inside.
+
+        Raises:
+            D2Error: an unknown name; a value of the wrong type or out of range.
+        """
+        if "temporal" in table:
+            raise D2Error(
+                "unknown setting of backbone 'temporal': whether there is time is decided by `[plan] temporal`"
+            )
+        return replace(cls.settings_kind.from_dict(table, "backbone"), temporal=temporal)
+
+    @classmethod
+    def create(
+        cls: type[Model],
+        positions: Tensor,
+        colors: Tensor,
+        times: Tensor,
+        *,
+        extent: float,
+        duration: float,
+        temporal: bool,
+        settings: Mapping[str, Any] | None = None,
+    ) -> Model:
+        """`from_points` with plain `settings` over the defaults: the entry point `d2_plugin.backbones`."""
+        chosen = cls.settings_from(settings or {}, temporal)
+        return cls.from_points(positions, colors, times, chosen, extent, duration)
 
     @classmethod
     def from_points(

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from typing import Annotated, Any
+from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from torch import Tensor
@@ -23,7 +23,7 @@ from d2_plugin.rasterizer import Splats, View
 from d2_plugin.settings import Range
 
 from .model import SplatModel, SplatSettings
-from .starting import identity_quaternions, isotropic_rows, refuse_temporal
+from .starting import identity_quaternions, isotropic_rows
 from .trainer import Trainer, TrainSettings
 
 __all__ = ["TrainSettings", "Trainer", "Yang4D", "Yang4DSettings", "create", "settings_from"]
@@ -48,6 +48,7 @@ class Yang4D(SplatModel):
     """
 
     settings: Yang4DSettings
+    settings_kind = Yang4DSettings
 
     @staticmethod
     def initial_rows(
@@ -115,24 +116,4 @@ def _time_degree(settings: Yang4DSettings) -> int:
     return settings.sh_time_degree if settings.temporal else 0
 
 
-def settings_from(table: Mapping[str, Any], temporal: bool = True) -> Yang4DSettings:
-    """`Yang4DSettings` from a plain table with tables "densify" and "raster" inside.
-
-    Raises:
-        D2Error: an unknown name; a value of the wrong type or out of range.
-    """
-    return replace(Yang4DSettings.from_dict(refuse_temporal(table), "backbone"), temporal=temporal)
-
-
-def create(
-    positions: Tensor,
-    colors: Tensor,
-    times: Tensor,
-    *,
-    extent: float,
-    duration: float,
-    temporal: bool,
-    settings: Mapping[str, Any] | None = None,
-) -> Yang4D:
-    """The entry point `d2_plugin.backbones`: a model from points, with plain `settings` over the defaults."""
-    return Yang4D.from_points(positions, colors, times, settings_from(settings or {}, temporal), extent, duration)
+create, settings_from = Yang4D.create, Yang4D.settings_from
