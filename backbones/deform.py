@@ -110,7 +110,7 @@ class Deform(SplatModel):
         raw, lives = self._canonical(), None
         if self.field is not None:
             rows, lives = self._living(min(max(view.time, 0.0), self.duration))
-            raw = {name: value[rows] for name, value in raw.items()}
+            raw = {name: value.index_select(0, rows) for name, value in raw.items()}
         noise = self._noise if torch.is_grad_enabled() else 0.0
         offsets = self.offsets(raw["positions"], view.time + noise)
         if offsets is not None:
@@ -127,7 +127,7 @@ class Deform(SplatModel):
         alive = temporal_marginal(offset, variances).detach() > MARGINAL_CUT
         rows = rows_to_draw(alive)
         marginal = temporal_marginal(torch.where(alive, offset, 0.0), variances) * alive  # no gradient is 0 * inf
-        return rows, marginal[rows]
+        return rows, marginal.index_select(0, rows)
 
     def _canonical(self) -> dict[str, Tensor]:
         g = self.gaussians
