@@ -2,26 +2,18 @@
 
 from __future__ import annotations
 
-import logging
-
 import torch
 from torch import Tensor
 
-from d2_plugin.backbones.deform import Deform, initial_rows
+from d2_plugin.backbones.deform import Deform
 from d2_plugin.protocol import Points
 
 from .inverse_deformation import invert_at_times
 from .watched import WatchedModel
 
-logger = logging.getLogger(__name__)
-
 
 class DeformAdapter(WatchedModel[Deform]):
-    """One `Deform` instance as a `d2_plugin.protocol.Backbone`; `proposed` and `accepted` count the inverted points."""
-
-    def __init__(self, model: Deform) -> None:
-        super().__init__(model)
-        self.proposed = self.accepted = 0
+    """One `Deform` instance as a `d2_plugin.protocol.Backbone`."""
 
     @torch.no_grad()
     def insert(self, points: Points) -> int:
@@ -37,12 +29,7 @@ class DeformAdapter(WatchedModel[Deform]):
             offsets = self.model.offsets(inversion.positions[chosen], time)
             if offsets is not None:
                 scales[chosen] *= torch.exp(-offsets.log_scales.mean(-1))
-        rows = initial_rows(inversion.positions, points.colors, scales, points.opacities, self.model.settings)
-        self.model.append(rows)
-        self.proposed += len(inversion.accepted)
-        self.accepted += int(inversion.accepted.sum())
-        logger.info("inverse deformation placed %d of %d points within tolerance so far", self.accepted, self.proposed)
-        return len(inversion.positions)
+        return super().insert(points._replace(positions=inversion.positions, scales=scales))
 
     def _deformed(self, positions: Tensor, time: float) -> Tensor:
         offsets = self.model.offsets(positions, time)

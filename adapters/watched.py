@@ -9,7 +9,7 @@ from torch import Tensor
 
 from d2_plugin.backbones.model import Observer, SplatModel
 from d2_plugin.gaussians.trained import trained_tensors
-from d2_plugin.protocol import RasterSettings, Render, Splats, View
+from d2_plugin.protocol import Points, RasterSettings, Render, Splats, View
 
 from .shared import Renders, Resizing
 
@@ -17,10 +17,7 @@ Model = TypeVar("Model", bound=SplatModel)
 
 
 class WatchedModel(Resizing, Observer, Generic[Model]):
-    """One model, of which every change of its Gaussians and every render is observed.
-
-    An adapter of a bundled backbone adds `insert`; everything else of the contract is here.
-    """
+    """One model, of which every change of its Gaussians and every render is observed."""
 
     def __init__(self, model: Model) -> None:
         super().__init__()
@@ -57,6 +54,14 @@ class WatchedModel(Resizing, Observer, Generic[Model]):
         if self.model.background is not None:
             render = self.model.background.behind(render, view)
         return render if self.model.appearance is None else self.model.appearance.seen_by(view.camera, render)
+
+    def insert(self, points: Points) -> int:
+        """Insert isotropic Gaussians at the points, living around the time of their frame; returns their number."""
+        rows = self.model.initial_rows(*points[:5], self.model.settings, self.model.duration)
+        if points.lifetimes is not None and "log_time_scales" in rows:
+            rows["log_time_scales"] = torch.minimum(rows["log_time_scales"], points.lifetimes.log())
+        self.model.append(rows)
+        return len(points.positions)
 
     def remove(self, mask: Tensor) -> None:
         """Delete the rows where `mask` [N] is True."""

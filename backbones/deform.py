@@ -18,22 +18,24 @@ from torch import Tensor
 from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.moving import MovingGaussians, moving_gaussians
 from d2_plugin.gaussians.native_slice import STATIC
-from d2_plugin.gaussians.rotation4d import rotation_matrices_3d, unit_quaternions
-from d2_plugin.gaussians.slicing import slice_gaussians
+from d2_plugin.gaussians.rotation4d import rotation_matrices_3d, temporal_marginal, unit_quaternions
+from d2_plugin.gaussians.slicing import LOG_SCALE_LIMIT, MARGINAL_CUT, rows_to_draw, slice_gaussians
 from d2_plugin.rasterizer import Splats, View
 from d2_plugin.settings import Seed, Share
 
 from .deform_fields import Box, Field, HexPlaneField, HexPlaneSettings, MlpField, MlpSettings, Offsets
-from .model import INITIAL_OPACITY, ROTATION_RATE, SplatModel, SplatSettings, decayed_rate, shared_rates
-from .starting import identity_quaternions, isotropic_rows, nearest_neighbour_scales, refuse_temporal
+from .model import SplatModel, SplatSettings, decayed_rate
+from .starting import identity_quaternions, isotropic_rows
 from .trainer import Trainer, TrainSettings
 
-__all__ = ["Deform", "DeformSettings", "TrainSettings", "Trainer", "create", "initial_rows", "settings_from"]
+__all__ = ["Deform", "DeformSettings", "TrainSettings", "Trainer", "create", "settings_from"]
 
 
 TIME_NOISE = 5e-3
 """Standard deviation of the noise on a training step's time at the first step, as a share of the duration; it falls to
 zero at half of the run. Official: a tenth of the frame interval, in real scenes."""
+LASTING = 10.0
+"""Temporal standard deviation of a Gaussian at the start, in durations: it exists at all instants."""
 FIELD_DECAY = 0.1
 """Learning rates of the field at the last step, as a share of the first; exponential in between."""
 
@@ -42,7 +44,7 @@ FIELD_DECAY = 0.1
 class DeformSettings(SplatSettings):
     """Model and optimizers of the backbone."""
 
-    field: Literal["mlp", "hexplane"] = "mlp"
+    field: Literal["mlp", "hexplane"] = "hexplane"
     """Kind of the deformation field."""
     warm_up: Share = 0.075
     """Share of the run without deformation: the canonical Gaussians settle first. Official: 3000 of 40000 steps."""
@@ -57,35 +59,43 @@ class DeformSettings(SplatSettings):
 class Deform(SplatModel):
     """N canonical Gaussians, their field, and an optimizer for each.
 
-    Parameters (raw) beside those of `SplatModel`: rotations [N, 4]. All Gaussians exist at all times.
+    Parameters (raw) beside those of `SplatModel`: rotations [N, 4], and with time: times [N], log_time_scales [N]. As
+    in SpacetimeGaussians (Li et al. 2024) a Gaussian fades away from its instant, o F(t); it starts to exist at all
+    times, unless it is inserted with a lifetime.
     """
 
     settings: DeformSettings
+    settings_kind = DeformSettings
 
-    def __init__(
-        self, rows: Mapping[str, Tensor], settings: DeformSettings, extent: float, duration: float, box: Box
-    ) -> None:
-        rates = shared_rates(settings, extent) | {"rotations": ROTATION_RATE}
-        super().__init__(rows, rates, settings, extent)
-        self.duration = max(duration, 1e-12)
+    def __init__(self, rows: Mapping[str, Tensor], settings: DeformSettings, extent: float, duration: float) -> None:
+        super().__init__(rows, settings, extent, duration)
         self._generator = torch.Generator().manual_seed(settings.seed)
         self.field: Field | None = None
         self.deforms = False
         self._noise = 0.0
         if settings.temporal:
+            box = Box.around(rows["positions"], extent)
             self.field = make_field(settings, box, self._generator).to(rows["positions"])
             self.field_optimizer = torch.optim.Adam(self.field.parameter_groups(), eps=1e-15, fused=True)
             self.deforms = settings.warm_up <= 0
 
-    @classmethod
-    def from_points(
-        cls, positions: Tensor, colors: Tensor, settings: DeformSettings, extent: float, duration: float
-    ) -> Deform:
-        """A model that starts at coloured points of any times: positions [N, 3] world, colors [N, 3] in 0..1."""
-        scales = nearest_neighbour_scales(positions).clamp(max=0.1 * extent)
-        opacities = torch.full_like(scales, INITIAL_OPACITY)
-        rows = initial_rows(positions, colors, scales, opacities, settings)
-        return cls(rows, settings, extent, duration, Box.around(positions, extent))
+    @staticmethod
+    def initial_rows(
+        positions: Tensor,
+        colors: Tensor,
+        times: Tensor,
+        scales: Tensor,
+        opacities: Tensor,
+        settings: DeformSettings,
+        duration: float,
+    ) -> dict[str, Tensor]:
+        """See `SplatModel.initial_rows`; they exist at all times."""
+        rows = isotropic_rows(positions, colors, scales, opacities, settings.sh_degree)
+        rows["rotations"] = identity_quaternions(len(positions), positions)
+        if settings.temporal:
+            rows["times"] = times
+            rows["log_time_scales"] = torch.full_like(scales, math.log(LASTING * max(duration, 1e-12)))
+        return rows
 
     def slice_at(self, view: View) -> Splats:
         """The 3D Gaussians at `view.time`, differentiable; a time outside the scene shows its first or last instant.
@@ -97,23 +107,35 @@ class Deform(SplatModel):
         """
         if self.field is not None and math.isnan(view.time):
             raise D2Error(f"the time of camera '{view.camera}', frame {view.frame} is NaN: give every view a time")
-        raw = self._canonical()
+        raw, lives = self._canonical(), None
+        if self.field is not None:
+            rows, lives = self._living(min(max(view.time, 0.0), self.duration))
+            raw = {name: value.index_select(0, rows) for name, value in raw.items()}
         noise = self._noise if torch.is_grad_enabled() else 0.0
         offsets = self.offsets(raw["positions"], view.time + noise)
         if offsets is not None:
             raw["positions"] = raw["positions"] + offsets.positions
             raw["log_scales"] = raw["log_scales"] + offsets.log_scales
             raw["left"] = raw["left"] + offsets.rotations
-        return slice_gaussians(raw)
+        splats = slice_gaussians(raw)
+        return splats if lives is None else splats._replace(opacities=splats.opacities * lives, rows=rows)
+
+    def _living(self, time: float) -> tuple[Tensor, Tensor]:
+        """Rows [M] of the Gaussians that exist at a time, for which alone the field is evaluated, and F(t) [M]."""
+        variances = (2 * self.gaussians["log_time_scales"].clamp(-LOG_SCALE_LIMIT, LOG_SCALE_LIMIT)).exp()
+        offset = time - self.gaussians["times"]
+        alive = temporal_marginal(offset, variances).detach() > MARGINAL_CUT
+        rows = rows_to_draw(alive)
+        marginal = temporal_marginal(torch.where(alive, offset, 0.0), variances) * alive  # no gradient is 0 * inf
+        return rows, marginal.index_select(0, rows)
 
     def _canonical(self) -> dict[str, Tensor]:
         g = self.gaussians
         return {name: g["rotations" if name == "left" else name] for name in STATIC}
 
     def moving(self) -> MovingGaussians | None:
-        """See `SplatModel.moving`: only while nothing is deformed."""
-        still = self.field is None or not self.deforms
-        return moving_gaussians(self._canonical(), self.harmonics()) if still else None
+        """See `SplatModel.moving`: only without time."""
+        return moving_gaussians(self._canonical(), self.harmonics()) if self.field is None else None
 
     def offsets(self, positions: Tensor, time: float) -> Offsets | None:
         """What the field adds at canonical `positions` [K, 3]; None where nothing is deformed (warm-up, no time)."""
@@ -172,36 +194,4 @@ def make_field(settings: DeformSettings, box: Box, generator: torch.Generator) -
     return HexPlaneField(box, settings.hexplane, generator)
 
 
-def initial_rows(
-    positions: Tensor, colors: Tensor, scales: Tensor, opacities: Tensor, settings: DeformSettings
-) -> dict[str, Tensor]:
-    """Raw rows of isotropic canonical Gaussians: positions [K, 3], colors [K, 3], scales [K], opacities [K]."""
-    rows = isotropic_rows(positions, colors, scales, opacities, settings.sh_degree)
-    return rows | {"rotations": identity_quaternions(len(positions), positions)}
-
-
-def settings_from(table: Mapping[str, Any], temporal: bool = True) -> DeformSettings:
-    """`DeformSettings` from a plain table with tables "mlp", "hexplane", "densify" and "raster" inside.
-
-    Raises:
-        D2Error: an unknown name; a value of the wrong type or out of range.
-    """
-    chosen = DeformSettings.from_dict(refuse_temporal(table), "backbone")
-    return dataclasses.replace(chosen, temporal=temporal)
-
-
-def create(
-    positions: Tensor,
-    colors: Tensor,
-    times: Tensor,
-    *,
-    extent: float,
-    duration: float,
-    temporal: bool,
-    settings: Mapping[str, Any] | None = None,
-) -> Deform:
-    """The entry point `d2_plugin.backbones`: a model from points, with plain `settings` over the defaults.
-
-    `times` is not used: the points of all instants are canonical, as in both official codes.
-    """
-    return Deform.from_points(positions, colors, settings_from(settings or {}, temporal), extent, duration)
+create, settings_from = Deform.create, Deform.settings_from

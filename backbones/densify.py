@@ -100,12 +100,13 @@ def prune(model: Growable, faint: float = FAINT) -> None:
 def _scatter_children(model: Growable, rows: dict[str, Tensor], children: slice, generator: torch.Generator) -> None:
     """Move split children to samples of their parent Gaussian (in 4D where there is time) and shrink them."""
     parents = {name: value[children] for name, value in rows.items()}
-    temporal = "times" in rows
+    rotations = model.rotations(parents)
+    temporal = len(rotations) == 4
     scales = parents["log_scales"].exp()
     if temporal:
         scales = torch.cat([scales, parents["log_time_scales"].exp()[:, None]], -1)
     noise = torch.randn(scales.shape, generator=generator, dtype=scales.dtype).to(scales.device)
-    offset = (model.rotations(parents) * (scales * noise).T).sum(1).T
+    offset = (rotations * (scales * noise).T).sum(1).T
     rows["positions"][children] += offset[:, :3]
     rows["log_scales"][children] -= SHRINK
     if temporal:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Annotated, Any
+from dataclasses import dataclass, field, replace
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
 import torch
@@ -22,6 +22,7 @@ from .appearance import Appearance
 from .background import Background
 from .densify import DensifySettings, densify
 from .gaussians import Gaussians
+from .starting import nearest_neighbour_scales
 
 STATISTICS = ("screen_gradient", "seen")
 """Per Gaussian: summed length of the screen-space gradient, and the number of views that had one."""
@@ -32,6 +33,8 @@ LAST_POSITION_RATE = 0.01
 """Learning rate of positions at the last step, as a share of that at the first; exponential in between."""
 ROTATION_RATE = 2e-3
 """Learning rate of quaternions."""
+TIME_RATE = 1.6e-3
+"""Learning rate of mean times, relative to the duration."""
 COLOR_RATE = 1e-2
 """Learning rate of the constant colour; higher harmonics learn at a twentieth of it."""
 
@@ -75,18 +78,22 @@ class Observer:
         """The parameters have changed their values."""
 
 
+Model = TypeVar("Model", bound="SplatModel")
+
+
 class SplatModel(ABC):
-    """N Gaussians with their optimizer; a backbone adds `slice_at` and `rotations`.
+    """N Gaussians with their optimizer; a backbone adds `initial_rows`, `slice_at` and `rotations`.
 
     Raw parameters that every backbone has: positions [N, 3], log_scales [N, 3], opacity_logits [N],
     base_colors [N, 1, 3], and where asked for harmonics [N, C - 1, 3].
     """
 
-    def __init__(
-        self, rows: Mapping[str, Tensor], learning_rates: Mapping[str, float], settings: SplatSettings, extent: float
-    ) -> None:
-        self.settings, self.extent = settings, extent
-        self.gaussians = Gaussians(rows, {name: learning_rates[name] for name in rows})
+    settings_kind: type[SplatSettings]
+
+    def __init__(self, rows: Mapping[str, Tensor], settings: SplatSettings, extent: float, duration: float) -> None:
+        self.settings, self.extent, self.duration = settings, extent, max(duration, 1e-12)
+        rates = learning_rates(settings, extent, self.duration)
+        self.gaussians = Gaussians(rows, {name: rates[name] for name in rows})
         self.gaussians.statistics = {name: rows["positions"].new_zeros(len(rows["positions"])) for name in STATISTICS}
         self.background = Background(self.gaussians.device) if settings.background else None
         self.appearance = Appearance(self.gaussians.device) if settings.appearance else None
@@ -94,8 +101,70 @@ class SplatModel(ABC):
         self.screen_offsets: Tensor | None = None
         self._drawn: Tensor | None = None
 
+    @classmethod
+    def settings_from(cls, table: Mapping[str, Any], temporal: bool = True) -> Any:
+        """Settings of the backbone, a `settings_kind`, from a plain table with tables inside.
+
+        Raises:
+            D2Error: an unknown name; a value of the wrong type or out of range.
+        """
+        if "temporal" in table:
+            raise D2Error(
+                "unknown setting of backbone 'temporal': whether there is time is decided by `[plan] temporal`"
+            )
+        return replace(cls.settings_kind.from_dict(table, "backbone"), temporal=temporal)
+
+    @classmethod
+    def create(
+        cls: type[Model],
+        positions: Tensor,
+        colors: Tensor,
+        times: Tensor,
+        *,
+        extent: float,
+        duration: float,
+        temporal: bool,
+        settings: Mapping[str, Any] | None = None,
+    ) -> Model:
+        """`from_points` with plain `settings` over the defaults: the entry point `d2_plugin.backbones`."""
+        chosen = cls.settings_from(settings or {}, temporal)
+        return cls.from_points(positions, colors, times, chosen, extent, duration)
+
+    @classmethod
+    def from_points(
+        cls: type[Model],
+        positions: Tensor,
+        colors: Tensor,
+        times: Tensor,
+        settings: Any,
+        extent: float,
+        duration: float,
+    ) -> Model:
+        """A model that starts at coloured points: positions [N, 3] world, colors [N, 3] in 0..1, times [N]."""
+        scales = nearest_neighbour_scales(positions).clamp(max=0.1 * extent)
+        opacities = torch.full_like(scales, INITIAL_OPACITY)
+        return cls(
+            cls.initial_rows(positions, colors, times, scales, opacities, settings, duration),
+            settings,
+            extent,
+            duration,
+        )
+
     def __len__(self) -> int:
         return len(self.gaussians)
+
+    @staticmethod
+    @abstractmethod
+    def initial_rows(
+        positions: Tensor,
+        colors: Tensor,
+        times: Tensor,
+        scales: Tensor,
+        opacities: Tensor,
+        settings: Any,
+        duration: float,
+    ) -> dict[str, Tensor]:
+        """Raw rows of isotropic Gaussians: positions [K, 3], colors [K, 3], times [K], scales [K], opacities [K]."""
 
     @abstractmethod
     def slice_at(self, view: View) -> Splats:
@@ -227,14 +296,17 @@ def _zeros(means: Tensor) -> Tensor:
     return means.new_zeros(len(means), 2)
 
 
-def shared_rates(settings: SplatSettings, extent: float) -> dict[str, float]:
-    """Learning rates of the tensors that every backbone has."""
+def learning_rates(settings: SplatSettings, extent: float, duration: float) -> dict[str, float]:
+    """Learning rates of the tensors that a backbone may have."""
     return {
         "positions": settings.position_rate * extent,
         "log_scales": settings.scale_rate,
         "opacity_logits": settings.opacity_rate,
         "base_colors": COLOR_RATE,
         "harmonics": COLOR_RATE / 20,
+        "times": TIME_RATE * duration,
+        "log_time_scales": settings.scale_rate,
+        **dict.fromkeys(("left", "right", "rotations"), ROTATION_RATE),
     }
 
 

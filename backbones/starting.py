@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 import torch
 from torch import Tensor
 
-from d2_plugin.errors import D2Error
 from d2_plugin.gaussians import spherical_harmonics as sh
 
 
@@ -46,10 +42,3 @@ def nearest_neighbour_scales(positions: Tensor) -> Tensor:
     k = min(3, count - 1) + 1
     chunks = [torch.cdist(chunk, positions).topk(k, largest=False).values for chunk in positions.split(1024)]
     return torch.cat(chunks)[:, 1:].square().mean(-1).sqrt().clamp(min=1e-7)
-
-
-def refuse_temporal(table: Mapping[str, Any]) -> Mapping[str, Any]:
-    """The table of a backbone unchanged; `temporal` is refused, because the plan decides whether there is time."""
-    if "temporal" in table:
-        raise D2Error("unknown setting of backbone 'temporal': whether there is time is decided by `[plan] temporal`")
-    return table

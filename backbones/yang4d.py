@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from typing import Annotated, Any
+from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from torch import Tensor
@@ -22,15 +22,11 @@ from d2_plugin.gaussians.slicing import slice_gaussians
 from d2_plugin.rasterizer import Splats, View
 from d2_plugin.settings import Range
 
-from .model import INITIAL_OPACITY, ROTATION_RATE, SplatModel, SplatSettings, shared_rates
-from .starting import identity_quaternions, isotropic_rows, nearest_neighbour_scales, refuse_temporal
+from .model import SplatModel, SplatSettings
+from .starting import identity_quaternions, isotropic_rows
 from .trainer import Trainer, TrainSettings
 
-__all__ = ["TrainSettings", "Trainer", "Yang4D", "Yang4DSettings", "create", "initial_rows", "settings_from"]
-
-
-TIME_RATE = 1.6e-3
-"""Learning rate of mean times, relative to the duration."""
+__all__ = ["TrainSettings", "Trainer", "Yang4D", "Yang4DSettings", "create", "settings_from"]
 
 
 @dataclass(frozen=True)
@@ -49,26 +45,30 @@ class Yang4D(SplatModel):
     """
 
     settings: Yang4DSettings
+    settings_kind = Yang4DSettings
 
-    def __init__(self, rows: Mapping[str, Tensor], settings: Yang4DSettings, extent: float, duration: float) -> None:
-        self.duration = max(duration, 1e-12)
-        rates = shared_rates(settings, extent) | {
-            "times": TIME_RATE * self.duration,
-            "log_time_scales": settings.scale_rate,
-            "left": ROTATION_RATE,
-            "right": ROTATION_RATE,
-        }
-        super().__init__(rows, rates, settings, extent)
+    @staticmethod
+    def initial_rows(
+        positions: Tensor,
+        colors: Tensor,
+        times: Tensor,
+        scales: Tensor,
+        opacities: Tensor,
+        settings: Yang4DSettings,
+        duration: float,
+    ) -> dict[str, Tensor]:
+        """See `SplatModel.initial_rows`.
 
-    @classmethod
-    def from_points(
-        cls, positions: Tensor, colors: Tensor, times: Tensor, settings: Yang4DSettings, extent: float, duration: float
-    ) -> Yang4D:
-        """A model that starts at coloured points: positions [N, 3] world, colors [N, 3] in 0..1, times [N]."""
-        scales = nearest_neighbour_scales(positions).clamp(max=0.1 * extent)
-        opacities = torch.full_like(scales, INITIAL_OPACITY)
-        rows = initial_rows(positions, colors, times, scales, opacities, settings, duration)
-        return cls(rows, settings, extent, duration)
+        Rotations start at the identity and the temporal standard deviation at sqrt(duration / 5), as in the official
+        code (a variance of a fifth of the duration, gaussian_model.py:280).
+        """
+        rows = isotropic_rows(positions, colors, scales, opacities, settings.sh_degree, _time_degree(settings))
+        rows["left"] = identity_quaternions(len(positions), positions)
+        if settings.temporal:
+            rows["times"] = times
+            rows["log_time_scales"] = torch.full_like(scales, 0.5 * math.log(max(duration, 1e-12) / 5))
+            rows["right"] = rows["left"].clone()
+        return rows
 
     def slice_at(self, view: View) -> Splats:
         """The 3D Gaussians at `view.time`, differentiable.
@@ -105,51 +105,8 @@ class Yang4D(SplatModel):
         return moving_gaussians(self._raw(), self.harmonics())
 
 
-def initial_rows(
-    positions: Tensor,
-    colors: Tensor,
-    times: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    settings: Yang4DSettings,
-    duration: float,
-) -> dict[str, Tensor]:
-    """Raw rows of isotropic Gaussians: positions [K, 3], colors [K, 3], times [K], scales [K], opacities [K].
-
-    Rotations start at the identity and the temporal standard deviation at sqrt(duration / 5), as in the official
-    code (a variance of a fifth of the duration, gaussian_model.py:280).
-    """
-    rows = isotropic_rows(positions, colors, scales, opacities, settings.sh_degree, _time_degree(settings))
-    rows["left"] = identity_quaternions(len(positions), positions)
-    if settings.temporal:
-        rows["times"] = times
-        rows["log_time_scales"] = torch.full_like(scales, 0.5 * math.log(max(duration, 1e-12) / 5))
-        rows["right"] = rows["left"].clone()
-    return rows
-
-
 def _time_degree(settings: Yang4DSettings) -> int:
     return settings.sh_time_degree if settings.temporal else 0
 
 
-def settings_from(table: Mapping[str, Any], temporal: bool = True) -> Yang4DSettings:
-    """`Yang4DSettings` from a plain table with tables "densify" and "raster" inside.
-
-    Raises:
-        D2Error: an unknown name; a value of the wrong type or out of range.
-    """
-    return replace(Yang4DSettings.from_dict(refuse_temporal(table), "backbone"), temporal=temporal)
-
-
-def create(
-    positions: Tensor,
-    colors: Tensor,
-    times: Tensor,
-    *,
-    extent: float,
-    duration: float,
-    temporal: bool,
-    settings: Mapping[str, Any] | None = None,
-) -> Yang4D:
-    """The entry point `d2_plugin.backbones`: a model from points, with plain `settings` over the defaults."""
-    return Yang4D.from_points(positions, colors, times, settings_from(settings or {}, temporal), extent, duration)
+create, settings_from = Yang4D.create, Yang4D.settings_from

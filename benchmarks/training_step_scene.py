@@ -105,7 +105,8 @@ class StepScene:
         moved = 0.1 * means[:, 2:] * (torch.rand(self.count, 3, generator=g) - 0.5)
         means = means + moved * (torch.arange(self.count) >= DRAWN)[:, None]
         times, scales = torch.rand(self.count, generator=g) * duration, sizes.mean(1)
-        rows: dict[str, Tensor] = backbone.initial_rows(means, colors, times, scales, opacities, settings, duration)
+        start = backbone.Yang4D.initial_rows
+        rows: dict[str, Tensor] = start(means, colors, times, scales, opacities, settings, duration)
         return rows | {"log_scales": sizes.log(), "left": quaternions, "right": quaternions.clone()}
 
     def _attach(self, model: object) -> D2Hooks:

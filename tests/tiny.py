@@ -79,7 +79,7 @@ def make_model(
     else:
         fields = {"mlp": MlpSettings(width=16, depth=3), "hexplane": HexPlaneSettings(features=4, resolutions=(4, 8))}
         settings = DeformSettings(**shared, field=backbone, **fields)
-        model = Deform.from_points(positions, colors, settings, extent=2.0, duration=0.5)
+        model = Deform.from_points(positions, colors, times, settings, extent=2.0, duration=0.5)
     with torch.no_grad():
         model.gaussians["opacity_logits"].zero_()  # opacity one half: enough to supervise depth from the first step
     return model

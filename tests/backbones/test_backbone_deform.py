@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
-from tiny import make_model, make_trainer, make_views, parameters
+from tiny import make_adapter, make_model, make_trainer, make_views, parameters
 
 from d2_plugin.backbones.deform import Deform, create
 from d2_plugin.backbones.deform_fields import (
     Box,
 )
+from d2_plugin.backbones.densify import grow
 from d2_plugin.backbones.model import decayed_rate
+from d2_plugin.gaussians.slicing import MARGINAL_CUT, slice_gaussians
+from d2_plugin.protocol import Points
 from d2_plugin.recordings.export.folder import save_recording
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.runs.run import Run
@@ -53,6 +57,53 @@ class TestModel:
         assert not trainer.model.deforms
         trainer.run(until=3)
         assert trainer.model.deforms, "0.075 of 40 steps"
+
+    def test_a_gaussian_fades_away_from_its_instant_and_goes_where_the_field_says(self, kind: str) -> None:
+        model, view, time = deforming(kind), make_views()[0], 0.2
+        with torch.no_grad():
+            model.gaussians["log_time_scales"].copy_(torch.linspace(-3, 3, len(model)))
+        rows = model.gaussians.parameters
+        offsets = model.offsets(rows["positions"], time)
+        factor = torch.exp(-0.5 * ((time - rows["times"]) / rows["log_time_scales"].exp()) ** 2)
+        kept = torch.nonzero(factor > MARGINAL_CUT).squeeze(-1)
+        assert 0 < len(kept) < len(model)
+        still = {
+            "positions": rows["positions"] + offsets.positions,
+            "log_scales": rows["log_scales"] + offsets.log_scales,
+            "left": rows["rotations"] + offsets.rotations,
+            "opacity_logits": rows["opacity_logits"],
+        }
+        expected, splats = slice_gaussians(still), model.slice_at(replace(view, time=time))
+        assert torch.equal(splats.rows, kept)
+        torch.testing.assert_close(splats.means, expected.means[kept])
+        torch.testing.assert_close(splats.covariances, expected.covariances[kept], rtol=1e-4, atol=1e-7)
+        torch.testing.assert_close(splats.opacities, (expected.opacities * factor)[kept])
+
+    def test_gaussians_exist_at_all_instants_at_the_start(self, kind: str) -> None:
+        model = make_model(backbone=kind)
+        for time in (0.0, model.duration):
+            opacities = model.slice_at(replace(make_views()[0], time=time)).opacities
+            torch.testing.assert_close(opacities, torch.full((len(model),), 0.5), rtol=0.006, atol=0)
+
+    def test_what_is_inserted_where_things_move_is_gone_at_other_instants(self, kind: str) -> None:
+        model, count = deforming(kind), 2
+        before = len(model)
+        one = torch.full((count,), 0.1)
+        lifetimes = torch.tensor([0.02, torch.inf])
+        make_adapter(model).insert(Points(torch.rand(count, 3), torch.rand(count, 3), one, one, one, lifetimes))
+        then, later = (model.slice_at(replace(make_views()[0], time=t)).rows.tolist() for t in (0.1, 0.4))
+        assert then == [*range(before + count)]
+        assert later == [*range(before), before + 1]
+
+    def test_a_split_leaves_instants_and_lifetimes_as_they_are(self, kind: str) -> None:
+        model = make_model(count=6, backbone=kind)
+        model.gaussians.statistics["screen_gradient"].fill_(1.0)
+        with torch.no_grad():
+            model.gaussians["log_scales"].zero_()  # large ones are split, not cloned
+        known = model.gaussians["times"].detach().clone()
+        grow(model, model.settings.densify, torch.Generator().manual_seed(0))
+        assert torch.equal(model.gaussians["times"], torch.cat([known, known]))
+        assert len(model.gaussians["log_time_scales"].unique()) == 1
 
     def test_noise_on_time_is_for_training_alone(self, kind: str) -> None:
         model, view = deforming(kind), make_views()[0]

@@ -204,7 +204,7 @@ def test_a_time_that_is_not_a_number_is_refused(backbone: str) -> None:
 
 
 class TestInsertionIntoADeformationField:
-    def test_what_cannot_be_inverted_takes_its_neighbours_offset_and_is_counted(self) -> None:
+    def test_what_cannot_be_inverted_takes_its_neighbours_offset(self) -> None:
         """cos(900 x) / 30 has slopes of 30: the plain fixed point leaps about for ever."""
         model = make_model(backbone="mlp")
         bend_field(model)
@@ -214,19 +214,16 @@ class TestInsertionIntoADeformationField:
             return Offsets(torch.cos(900 * positions) / 30, still[:, :4], still[:, 4:])
 
         model.field.forward = steep
-        adapter = make_adapter(model)
         points = some_points(200)._replace(times=torch.zeros(200), scales=torch.full((200,), 1e-4))
         plain = points.positions.clone()
         for _ in range(50):
             plain = points.positions - torch.cos(900 * plain) / 30
         left = (plain + torch.cos(900 * plain) / 30 - points.positions).norm(dim=-1)
         assert left.median() > 1e-2, "the plain fixed point must diverge: this test could not fail"
-        assert adapter.insert(points) == 200
+        assert make_adapter(model).insert(points) == 200
         placed = model.gaussians["positions"][-200:].detach()
         residual = (placed + torch.cos(900 * placed) / 30 - points.positions).norm(dim=-1)
         assert torch.isfinite(placed).all()
-        assert int((residual <= 0.5e-4).sum()) >= adapter.accepted
-        assert adapter.accepted < 200
         assert (residual < 0.15).all(), "nobody is further off than two offsets"
 
     def test_during_the_warm_up_canonical_space_is_the_world(self) -> None:

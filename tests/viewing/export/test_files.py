@@ -62,12 +62,6 @@ class TestStraightLines:
             for name in ("means", "covariances", "opacities"):
                 torch.testing.assert_close(getattr(moved, name), getattr(true, name), rtol=1e-9, atol=1e-12)
 
-    def test_a_model_whose_field_still_warms_up_stands_still(self) -> None:
-        model = sharp_model("hexplane")
-        assert model.moving() is None
-        model.deforms = False
-        assert model.moving().motion is None
-
     def test_a_factor_is_the_square_root_of_its_covariance(self) -> None:
         covariances = sharp_model("yang4d").moving().covariances
         torch.testing.assert_close(covariances_of(cholesky(covariances)), covariances, rtol=1e-9, atol=1e-15)
