@@ -21,7 +21,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from d2_plugin.arrays import read_array
 from d2_plugin.errors import D2Error
 from d2_plugin.extras import import_pycolmap
 from d2_plugin.priors.geometry import relative_pose
@@ -63,8 +62,6 @@ class SparsePoints:
 
     positions: np.ndarray  # [P, 3] float64, world
     colors: np.ndarray  # [P, 3] float32 in 0..1, mean over the images that see the point
-    errors: np.ndarray  # [P] float32, mean reprojection error in pixels
-    track_lengths: np.ndarray  # [P] int32, number of images that see the point
     frames: np.ndarray  # [P] int64, frame the point was seen in
 
     def __len__(self) -> int:
@@ -73,35 +70,13 @@ class SparsePoints:
     @classmethod
     def empty(cls) -> SparsePoints:
         """No points."""
-        return cls(
-            np.zeros((0, 3)),
-            np.zeros((0, 3), np.float32),
-            np.zeros(0, np.float32),
-            np.zeros(0, np.int32),
-            np.zeros(0, np.int64),
-        )
+        return cls(np.zeros((0, 3)), np.zeros((0, 3), np.float32), np.zeros(0, np.int64))
 
     @classmethod
     def joined(cls, parts: Iterable[SparsePoints]) -> SparsePoints:
         """The points of all `parts`, in their order."""
         together = [cls.empty(), *parts]
         return cls(*(np.concatenate([getattr(part, field.name) for part in together]) for field in fields(cls)))
-
-    def save(self, path: Path) -> None:
-        """Write a compressed .npz with one array per attribute."""
-        with open(path, "wb") as file:  # np.savez would append .npz to another suffix
-            np.savez_compressed(file, **{field.name: getattr(self, field.name) for field in fields(self)})
-
-    @classmethod
-    def load(cls, path: Path) -> SparsePoints:
-        """Read what `save` wrote."""
-        remedy = "delete the file and build again"
-        points = cls(*(read_array(path, remedy, key=field.name) for field in fields(cls)))
-        count = len(points.positions) if points.positions.ndim == 2 else -1
-        shapes = [getattr(points, field.name).shape for field in fields(cls)]
-        if shapes != [(count, 3), (count, 3), (count,), (count,), (count,)]:
-            raise D2Error(f"{path} has points of shapes {shapes}, expected (N, 3) twice and (N,) else: {remedy}")
-        return points
 
 
 def triangulate(
@@ -306,8 +281,6 @@ def _collected(model: Any, images: Sequence[np.ndarray], frame: int) -> SparsePo
     return SparsePoints(
         positions=np.array([point.xyz for point in points], np.float64),
         colors=np.array(colors, np.float32) / 255,
-        errors=np.array([point.error for point in points], np.float32),
-        track_lengths=np.array([point.track.length() for point in points], np.int32),
         frames=np.full(len(points), frame, np.int64),
     )
 
