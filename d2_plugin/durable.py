@@ -80,6 +80,8 @@ def writing(path: Path) -> Iterator[None]:
 
 def make_folder(path: Path) -> Path:
     """The folder at `path`, made with those above it where they are missing."""
+    if path.is_file():
+        raise D2Error(f"{path} is a file, expected a folder: choose another place")
     with writing(path):
         path.mkdir(parents=True, exist_ok=True)
     return path
@@ -146,15 +148,15 @@ def refuse_inside_images(path: Path) -> None:
     real = Path(os.path.realpath(path))
     for folder in (real, *real.parents):
         if folder.name == "images" and (folder.parent / "cameras.json").is_file():
-            raise D2Error(f"{path} is in {folder}, where every folder is a camera: give another --output")
+            raise D2Error(f"{path} is in {folder}, where every folder is a camera: choose another place")
 
 
 def refuse_foreign(path: Path, sign: str, command: str) -> None:
     """Refuse to replace a file without the sign, among its first 1000 bytes, of the command that writes it."""
     if path.exists():
-        with opened(path, "give another --output") as file:
+        with opened(path, "choose another place") as file:
             if sign.encode() not in file.read(1000):
-                raise D2Error(f"{path} was not written by `{command}` and is kept: give another --output")
+                raise D2Error(f"{path} was not written by `{command}` and is kept: choose another place")
 
 
 def remove_leftovers(folder: Path, below: bool = True) -> None:

@@ -15,7 +15,7 @@ import warnings
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, NoReturn, TypeVar, cast
 
 import torch
 from torch import Tensor
@@ -261,6 +261,9 @@ class D2Hooks:
         self._count = len(self.backbone)
         self._finite.step = self._finite.saved = state.get("step", 0)
         self.inserted_at = state.get("inserted_at", torch.zeros(self._count, dtype=torch.int32)).cpu()
+
+    def __reduce__(self) -> NoReturn:
+        raise D2Error("D2Hooks are neither copied nor pickled: attach new ones and give them d2.state_dict()")
 
     def _begin(self, step: int) -> None:
         """Give the backbone the number of the step, and notice changes that nobody reported."""

@@ -112,11 +112,10 @@ def append_rows(path: Path, rows: Iterable[Row]) -> None:
         D2Error: the file holds something else; nothing is written.
     """
     if path.exists():
-        remedy = "give another --output"
-        with opened(path, remedy) as file:
+        with opened(path, "give another --output") as file:
             begin = file.read(1).strip()
         if begin not in (b"", b"{"):
-            raise D2Error(f"{path} is no file of rows, one JSON object a line, to which more could be added: {remedy}")
+            raise D2Error(f"{path} is no file of rows, one JSON object a line: give another --output")
     append(path, "".join(as_line(row) for row in rows))
 
 

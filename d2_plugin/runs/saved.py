@@ -88,8 +88,6 @@ def read_metrics(folder: Path) -> dict[str, Any]:
 def claim(folder: Path, identity: Mapping[str, Any]) -> None:
     """Take the folder, or find this very run in it; anything else is refused and nothing is written."""
     refuse_inside_images(folder)
-    if folder.exists() and not folder.is_dir():
-        raise D2Error(f"{folder} is a file, and a run needs a folder: give another --output")
     if (folder / "run.json").exists():
         _refuse_another(folder, identity)
         return

@@ -108,8 +108,6 @@ class PriorStore:
 
         root = Path(path)
         refuse_inside_images(root)
-        if root.exists() and not root.is_dir():
-            raise D2Error(f"{root} is a file, and the priors need a folder: choose another output folder")
         with in_turn(make_folder(root)):
             existing = cls._existing(root, about)
             place = cls.place(root, cameras)

@@ -229,7 +229,7 @@ class TestMistakes:
     ) -> None:
         before = contents(recording)
         message = refused(capsys, train(recording, recording / place))
-        assert "where every folder is a camera: give another --output" in message
+        assert "where every folder is a camera: choose another place" in message
         assert contents(recording) == before
         assert not (recording / "images" / "run").exists()
 

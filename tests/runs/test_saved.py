@@ -15,7 +15,7 @@ import pytest
 import torch
 from tiny import ALL_HOOKS, make_model, make_trainer
 
-from d2_plugin.backbones import yang4d
+from d2_plugin.backbones import model
 from d2_plugin.commands.cli import main
 from d2_plugin.durable import write_archive, write_table
 from d2_plugin.errors import D2Error
@@ -185,7 +185,7 @@ class TestARunThatDiverges:
     def test_exits_with_one_sentence_and_is_not_saved(
         self, scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr(yang4d, "TIME_RATE", math.inf)
+        monkeypatch.setattr(model, "TIME_RATE", math.inf)
         words = ["train", str(scene), "--train-cameras", "train0,train1", "--hooks", "none", "--iterations", "20"]
         assert main([*words, "--plan.temporal", "true", "--output", str(tmp_path / "run")]) == 2
         told = capsys.readouterr().err.splitlines()[-1]
@@ -222,7 +222,7 @@ class TestOneWriter:
 
     def test_a_file_in_the_place_of_the_folder_is_told(self, scene: Path, tmp_path: Path) -> None:
         (tmp_path / "run").write_text("mine")
-        with pytest.raises(D2Error, match="is a file, and a run needs a folder"):
+        with pytest.raises(D2Error, match="is a file, expected a folder: choose another place"):
             bare(scene, tmp_path / "run")
 
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 import logging
 import math
 import os
+import pickle
 import signal
 import subprocess
 import sys
@@ -216,6 +218,12 @@ def test_what_torch_does_to_every_tensor_is_refused_where_d2_cannot_work_with_it
     ):
         with around(), pytest.raises(D2Error, match="D2 needs float32 as the default dtype"):
             call()
+
+
+@pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy, pickle.dumps])
+def test_hooks_are_not_copied(copied: Callable) -> None:
+    with pytest.raises(D2Error, match=r"neither copied nor pickled: .* give them d2.state_dict\(\)"):
+        copied(hooks())
 
 
 def test_two_threads_at_once_are_refused() -> None:

@@ -140,7 +140,7 @@ class TestThePage:
     def test_a_page_of_somebody_else_is_not_replaced(self, tmp_path: Path) -> None:
         scene, path = make_scene(sharp_model("yang4d", 50)), tmp_path / "scene.html"
         path.write_text("<p>mine</p>")
-        with pytest.raises(D2Error, match="was not written by `d2 export` and is kept: give another --output"):
+        with pytest.raises(D2Error, match="was not written by `d2 export` and is kept: choose another place"):
             write_export([scene], Export((Path(),)), tmp_path)
         assert path.read_text() == "<p>mine</p>"
         path.unlink()
