@@ -50,7 +50,7 @@ def build_priors_on_cluster(
         recording: the recording, whose files every worker can read under the same paths.
         cameras, output, settings, sparse_points: as for `build_priors`; `output` must be the same folder for everyone.
         scheduler: address of a dask scheduler, as `tcp://host:8786`; workers on this machine where None.
-        workers: number of processes on this machine, where there is no scheduler.
+        workers: most processes on this machine, where there is no scheduler; no more than there are parts.
         progress: called after every part, with images done and in all.
 
     Raises:
@@ -61,9 +61,8 @@ def build_priors_on_cluster(
     folder = Path(output).absolute()
     if recording.path is not None:
         recording = replace(recording, path=recording.path.absolute())
-    with cluster_client(scheduler, workers) as client, client.as_current():
-        # Parts are whole blocks, since frames within a block are built in order.
-        blocks = len(frame_blocks(recording.frames, settings.stereo))
+    blocks = len(frame_blocks(recording.frames, settings.stereo))  # parts are whole blocks: frames in one have an order
+    with cluster_client(scheduler, min(workers, blocks)) as client, client.as_current():
         count = min(blocks, PARTS_PER_WORKER * max(len(client.nthreads()), 1))
         shared = {"sparse_points": None if sparse_points is None else np.asarray(sparse_points), "pure": False}
         parts = [
