@@ -341,8 +341,9 @@ class D2Hooks:
         for hook in self.hooks.values():
             hook.follow(index)
         self._count = len(index)
-        self.inserted_at = followed(self.inserted_at, index.cpu(), self._inserting)
-        self._fresh = followed(self._fresh, index.cpu(), int(not self._inserting))
+        index = index.cpu()
+        self.inserted_at = followed(self.inserted_at, index, self._inserting)
+        self._fresh = followed(self._fresh, index, int(not self._inserting))
 
     def _check_count(self) -> None:
         """The safety net of the contract: a change of N that nobody reported resets per-Gaussian state."""
