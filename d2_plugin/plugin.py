@@ -23,7 +23,7 @@ from torch import Tensor
 from d2_plugin.config import D2Config
 from d2_plugin.errors import D2Error
 from d2_plugin.hooks import HOOKS, Context, Hook, PriorLoader
-from d2_plugin.hooks.edits import Idle, followed, limited
+from d2_plugin.hooks.edits import Idle, faintest, followed, limited
 from d2_plugin.hooks.expected import (
     StepOrder,
     check_backbone,
@@ -97,6 +97,7 @@ class D2Hooks:
         self._count = len(backbone)
         self._warned = self._idle_insert = False
         self._inserting = 0  # the step while the backbone inserts for us, else 0
+        self._fresh = torch.zeros(0, dtype=torch.int32)  # 1 for what the trainer added since our last step
         self.inserted_at = torch.zeros(self._count, dtype=torch.int32)
         """Per Gaussian [N], the step at which D2 inserted it; 0 for the backbone's own."""
         self._idle = Idle(self.hooks, config.retire_after)
@@ -228,9 +229,11 @@ class D2Hooks:
         edits = [(name, edit) for name, edit in proposals if edit is not None]
         for name, edit in proposals:
             self._retire_if_idle(step, name, edit, context)
+        edits += self._above_cap(step, context)
         removed, inserted = self._remove(step, edits), self._insert(step, edits)
         report = Report(inserted, removed, len(self.backbone), step)
         self.log.record_step(report)
+        self._fresh = self._fresh[:0]
         return report
 
     def state_dict(self) -> dict[str, Any]:
@@ -297,6 +300,18 @@ class D2Hooks:
             self.trace.append(Trace(step, name, "retire", 0))
             _log.info("%s retires at step %d: its last evaluations changed next to nothing", name, step)
 
+    def _above_cap(self, step: int, context: Context) -> list[tuple[str, Edit]]:
+        """What the trainer has just added above `densify.max_gaussians`, where the user has set that."""
+        most = None if self.config.densify is None else self.config.densify.max_gaussians
+        excess = 0 if most is None else len(self.backbone) - most
+        if excess <= 0 or not self._fresh.any() or not call_optional(self.backbone, "active", step, default=True):
+            return []
+        remove = faintest(self._fresh, excess, (self.backbone.slice_at(view) for view in context.sample()))
+        if not self.log.capped:
+            _log.info("step %d: what the trainer adds above max_gaussians = %d is removed, faintest first", step, most)
+        self.log.capped += int(remove.sum())
+        return [("densify", Edit(remove=remove))]
+
     def _remove(self, step: int, edits: Sequence[tuple[str, Edit]]) -> int:
         masks = [(name, edit.remove) for name, edit in edits if edit.remove is not None]
         if not masks:
@@ -329,7 +344,9 @@ class D2Hooks:
         for hook in self.hooks.values():
             hook.follow(index)
         self._count = len(index)
-        self.inserted_at = followed(self.inserted_at, index.cpu(), self._inserting)
+        index = index.cpu()
+        self.inserted_at = followed(self.inserted_at, index, self._inserting)
+        self._fresh = followed(self._fresh, index, int(not self._inserting))
 
     def _check_count(self) -> None:
         """The safety net of the contract: a change of N that nobody reported resets per-Gaussian state."""

@@ -48,6 +48,7 @@ class OnGpu(Tensor):
 
     device = property(lambda self: GPU)  # type: ignore[assignment]
     is_cuda = property(lambda self: True)  # type: ignore[assignment]
+    is_meta = property(lambda self: False)  # type: ignore[assignment]
 
     def data_ptr(self) -> int:
         """Kernels of the shim run on the CPU."""

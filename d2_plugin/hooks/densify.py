@@ -34,6 +34,9 @@ INSTANTS = 9
 FEWEST = 3
 """With fewer there is no median to differ from."""
 
+MOST = 1_000_000
+"""Gaussians up to which there is insertion, where `max_gaussians` is not set."""
+
 MOST_MOVING = 0.5
 """Where more of an image differs, it is the light or the camera that changes, and nothing is known."""
 
@@ -60,8 +63,9 @@ class DensifyConfig(HookConfig):
     evaluation so covers what the prior knows; later ones repair."""
     budget_per_view: Count = 20_000
     """No more samples than this in one view and evaluation: they lie further apart instead."""
-    max_gaussians: Count = 1_000_000
-    """No insertion beyond this number of Gaussians."""
+    max_gaussians: Count | None = None
+    """No more Gaussians than this, by insertion or by the trainer's own densification: the faintest of those that it
+    added last go. None: a million for insertion, and no limit for the trainer."""
     scale: Annotated[float, Range(1e-3, 1000)] = 0.7
     """Standard deviation of a new Gaussian, which is round, in units of the distance between samples."""
     opacity: Annotated[float, Range(1e-6, 1)] = 0.1
@@ -186,7 +190,8 @@ class Densify(Hook):
 
     def edit(self, context: Context) -> Edit | None:
         """Points from the under-reconstructed pixels of the evaluated views, within the budget."""
-        room = self.config.max_gaussians - len(context.backbone)
+        most = self.config.max_gaussians
+        room = (MOST if most is None else most) - len(context.backbone)
         inserted: list[Points] = []
         for surveyed, lives in (
             *((surveyed, self._lifetimes(surveyed.view, context)) for surveyed in context.evaluation),

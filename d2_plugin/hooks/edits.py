@@ -9,6 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from d2_plugin.protocol import Splats
+
 _log = logging.getLogger(__name__)
 
 
@@ -27,6 +29,19 @@ def spread_over(mask: Tensor, most: int) -> Tensor:
     rows = torch.nonzero(mask).squeeze(1)
     chosen = torch.arange(most, device=mask.device) * len(rows) // max(most, 1)
     return torch.zeros_like(mask).index_fill(0, rows[chosen], True)
+
+
+def faintest(fresh: Tensor, excess: int, slices: Iterable[Splats]) -> Tensor:
+    """Of the rows `fresh` [N] (not 0 where the trainer has just added one) at most `excess` that are least opaque in
+    any of the slices: bool [N], on the device of the slices."""
+    brightest = torch.zeros(len(fresh))
+    for splats in slices:
+        brightest = brightest.to(splats.opacities)
+        brightest[splats.rows] = torch.maximum(brightest[splats.rows], splats.opacities)
+    fresh = fresh.to(brightest.device)
+    order = torch.argsort(torch.where(fresh > 0, brightest, torch.inf), stable=True)
+    chosen = order[: min(excess, int(fresh.count_nonzero()))]
+    return torch.zeros_like(fresh, dtype=torch.bool).index_fill(0, chosen, True)
 
 
 def followed(values: Tensor, index: Tensor, new: int) -> Tensor:

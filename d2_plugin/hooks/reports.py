@@ -60,7 +60,7 @@ class RunLog:
 
     def __init__(self, hooks: Mapping[str, Hook]) -> None:
         self.hooks = hooks
-        self.inserted = self.removed = self.gaussians = self.last_step = self._at_first = 0
+        self.inserted = self.removed = self.capped = self.gaussians = self.last_step = self._at_first = 0
         self._started, self._ended = False, False
         self._on_report: OnReport | None = None
         self._writer: ScalarWriter | None = None
@@ -129,7 +129,8 @@ class RunLog:
 
     def summary(self) -> str:
         """What D2 did, in one line."""
-        changes = f"{self.inserted} inserted, {self.removed} removed, {self.others:+d} by the trainer itself"
+        above = f" ({self.capped} above max_gaussians)" if self.capped else ""
+        changes = f"{self.inserted} inserted, {self.removed} removed{above}, {self.others:+d} by the trainer itself"
         losses = [f"{name} {mean.first:.3g} at first, {mean.now():.3g} at last" for name, mean in self._terms.items()]
         after = f"{self.gaussians} Gaussians after step {self.last_step}"
         return "; ".join([f"{', '.join(self.hooks) or 'no hook'}: {changes}, {after}", *losses])

@@ -11,13 +11,14 @@ from pathlib import Path
 import pytest
 import torch
 from fake_gpu import FakeGpu, OnGpu, fake_gpu, move  # noqa: F401  a fixture
+from hooks.test_motion import Halfway
 from mimics.workplace import furnish
 from repositories import VARIANTS
 from tiny import HEIGHT, WIDTH
 from torch import Tensor
 
 from d2_plugin import D2Hooks
-from d2_plugin.config import D2Config, DepthLossConfig
+from d2_plugin.config import D2Config, DepthLossConfig, MotionConfig
 from d2_plugin.hooks.densify import DensifyConfig
 from d2_plugin.hooks.prune import PruneConfig
 
@@ -32,12 +33,34 @@ SMALL = 512
 """Bytes of matrices and numbers."""
 
 
-def on_the_gpu(name: str) -> tuple[object, list[object]]:
-    """The adapter of a mimic, and two of its cameras."""
+def on_the_gpu(name: str, count: int = 2) -> tuple[object, list[object]]:
+    """The adapter of a mimic, and some of its cameras."""
     standing, moved = VARIANTS[name](), {}
     items = name == "gsplat_dynamic"  # a data set's items stay on the host
-    cameras = [camera if items else move(camera, moved) for camera in standing.cameras[:2]]
+    cameras = [camera if items else move(camera, moved) for camera in standing.cameras[:count]]
     return move(standing.adapter, moved), cameras
+
+
+@pytest.mark.parametrize("name", sorted(VARIANTS.keys() - {"deformable3d 6dof"}))
+def test_motion_waits_once_a_step(name: str, fake_gpu: FakeGpu) -> None:  # noqa: F811
+    adapter, cameras = on_the_gpu(name, count=6)
+    d2 = D2Hooks(D2Config(finite_every=0, motion=MotionConfig()), adapter, Halfway())
+    cameras.append(cameras[0])
+    for step, camera in enumerate(cameras, 1):  # each view is checked, each prior read, the window of SSIM made, once
+        d2.loss(step, camera)
+        d2.step(step)
+    supervised = 0
+    for step, camera in enumerate(cameras, 1 + len(cameras)):
+        with fake_gpu.counting():
+            loss = d2.loss(step, camera)
+            if isinstance(loss, Tensor):
+                loss.backward()
+            d2.step(step)
+            waits, copied = own(fake_gpu.where), Counter(fake_gpu.copied)
+        supervised += isinstance(loss, Tensor)
+        assert sum(waits.values()) <= 1 + 2 * (name in ONE_MORE), waits  # their mask for the slice and for its colours
+        assert copied["to device"] <= 4 * WIDTH * HEIGHT + SMALL, copied
+    assert (supervised > 0) == (name != "hust4d coarse")
 
 
 def own(waits: Counter[str]) -> Counter[str]:
