@@ -49,8 +49,8 @@ def test_an_object_that_is_no_camera() -> None:
     [
         ({"K": torch.zeros(3, 3)}, "focal lengths 0 and 0, expected positive"),
         ({"K": torch.full((3, 3), torch.nan)}, "K of the view .* not finite"),
-        ({"K": torch.eye(4)}, r"K of the view .* is \(4, 4\), expected a tensor \(3, 3\)"),
-        ({"T_camera_world": None}, r"T_camera_world .* is NoneType, expected a tensor \(4, 4\)"),
+        ({"K": torch.eye(4)}, r"K of the view .* is torch.float32 \(4, 4\), expected a plain tensor \(3, 3\)"),
+        ({"T_camera_world": None}, r"T_camera_world .* is NoneType, expected a plain tensor \(4, 4\)"),
         ({"width": 0}, "0x24 pixels, expected at least one"),
     ],
 )
