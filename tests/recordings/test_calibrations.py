@@ -160,7 +160,10 @@ NO_UNDISTORTION = "cam0 .* model {}, .*pinhole-equi or pinhole-radtan"
         ),
         (lambda path: path / "b.json", "no such calibration"),
         (file_with("a.yaml", b"a: &a [1]\ncam0: *a\n"), "has YAML aliases"),
-        (file_with("b.yaml", b"cam0: " + b"[" * 200_000 + b"]" * 200_000), "nested more than 64 deep|maximum nesting depth"),
+        (
+            file_with("b.yaml", b"cam0: " + b"[" * 200_000 + b"]" * 200_000),
+            "nested more than 64 deep|maximum nesting depth",
+        ),
         (file_with("a.toml", UNPLACED), "cam_0 .* has no rotation and no translation: Caliscope could not place it"),
         (kalibr_with("pinhole", "omni"), NO_UNDISTORTION.format("omni")),
         (kalibr_with("radtan", "fov"), NO_UNDISTORTION.format("fov")),
