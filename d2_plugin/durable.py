@@ -81,7 +81,7 @@ def writing(path: Path) -> Iterator[None]:
 def make_folder(path: Path) -> Path:
     """The folder at `path`, made with those above it where they are missing."""
     if path.is_file():
-        raise D2Error(f"{path} is a file, expected a folder: choose another place")
+        raise CannotWrite(f"{path} is a file, expected a folder: choose another place")
     with writing(path):
         path.mkdir(parents=True, exist_ok=True)
     return path

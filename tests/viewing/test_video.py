@@ -110,7 +110,7 @@ def test_a_place_where_no_video_can_be_is_one_sentence(tmp_path: Path) -> None:
     with pytest.raises(D2Error, match="a video of 100000 images per second cannot be: give --fps from 0.001 to 1000"):
         write(tmp_path / "a.mp4", soft(1, 32, 32), 1e5)
     for path in (tmp_path / "file" / "a.mp4", tmp_path / f"{'y' * 300}.mp4", tmp_path / "folder.mp4"):
-        with pytest.raises(D2Error, match="cannot write"):
+        with pytest.raises(D2Error, match="cannot write|is a file, expected a folder"):
             write(path, soft(1, 32, 32))
     with pytest.raises(D2Error, match="a video of format mp4 needs a name that ends so, got file"):
         write(tmp_path / "file", soft(1, 32, 32))
