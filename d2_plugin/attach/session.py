@@ -280,7 +280,7 @@ class Session:
         if 0 < done.inserted * MUCH_GROWTH < done.others and not self._growth_logged:
             self._growth_logged = True
             made = f"made {done.others} Gaussians beside the {done.inserted} that D2 inserted"
-            sentence = "iteration %d: the trainer's own densification has %s: end it earlier or raise its threshold"
+            sentence = "iteration %d: the trainer's own densification has %s: set densify.max_gaussians"
             log.warning(sentence, done.last_step, made)
 
 
