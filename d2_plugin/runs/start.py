@@ -6,7 +6,7 @@ import io
 import warnings
 from collections import OrderedDict
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,15 +17,20 @@ from torch import Tensor
 from d2_plugin.durable import opened_archive, write_archive
 from d2_plugin.errors import D2Error, MissingExtra
 from d2_plugin.priors.colmap.points import triangulate_frames
+from d2_plugin.priors.stereo.depth_range import FEWEST
 from d2_plugin.protocol import View
 from d2_plugin.reading import parsing
 from d2_plugin.recordings import Recording
+from d2_plugin.recordings.recording import Camera
 
 POINTS_FORMAT = 1
 """Of points.npz."""
 
 MIN_POINTS = 1000
 """Fewer triangulated points than this are filled up with random ones; more random ones cost quality."""
+
+NEIGHBOURS = 3
+"""Triangulated points of which a random one that a single camera sees takes the depth of one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,13 +200,47 @@ def initial_points(
     """Where Gaussians start: the triangulated points, filled up to `minimum` with random ones.
 
     A random point lies on the ray of a random pixel of a random training image, at a depth drawn uniformly in
-    inverse depth between near and far, and takes the pixel's colour.
+    inverse depth between near and far, and takes the pixel's colour. Where no other training camera would see it,
+    nothing ever moves it to its depth, and held-out cameras see it beside its place: there it begins at the depth of
+    what was triangulated around the pixel.
     """
     missing, rng, parts = max(minimum - len(triangulated), 0), np.random.default_rng(seed), [triangulated]
     for place, camera in enumerate(cameras):
         share = len(range(place, missing, len(cameras)))
-        parts.append(_random_points(recording, camera, extent, share, rng))
+        drawn = _random_points(recording, camera, extent, share, rng)
+        others = [recording.cameras[name] for name in cameras if name != camera]
+        parts.append(_seen_alone_beside(drawn, recording.cameras[camera], others, triangulated))
     return TimedPoints.joined(parts)
+
+
+def _seen_alone_beside(
+    drawn: TimedPoints, own: Camera, others: Sequence[Camera], triangulated: TimedPoints
+) -> TimedPoints:
+    """The points with those that no other camera sees at the depth of a triangulated one near by in the own image; as
+    they are where the own camera sees too few of these."""
+    shown, depths, seen = _projected(own, triangulated.positions)
+    pixels, _, _ = _projected(own, drawn.positions)
+    alone = ~np.any([_projected(camera, drawn.positions)[2] for camera in others], axis=0) if others else None
+    if alone is None or not alone.any() or np.count_nonzero(seen) < FEWEST:
+        return drawn
+    apart = np.linalg.norm(pixels[alone][:, None] - shown[seen][None], axis=-1)
+    nearest = np.argsort(apart, axis=1)[:, :NEIGHBOURS]
+    chosen = nearest[np.arange(len(nearest)), np.arange(len(nearest)) % NEIGHBOURS]
+    positions = drawn.positions.copy()
+    rotation, translation = own.T_camera_world[:3, :3], own.T_camera_world[:3, 3]
+    in_camera = positions[alone] @ rotation.T + translation
+    positions[alone] = (in_camera * (depths[seen][chosen] / in_camera[:, 2])[:, None] - translation) @ rotation
+    return replace(drawn, positions=positions)
+
+
+def _projected(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Pixels [K, 2] and planar depths [K] of world points [K, 3], and which of them the image holds."""
+    in_camera = points @ camera.T_camera_world[:3, :3].T + camera.T_camera_world[:3, 3]
+    depths = in_camera[:, 2]
+    front = depths > 0
+    pixels = (in_camera @ camera.K.T)[:, :2] / np.where(front, depths, 1)[:, None]
+    inside = (pixels >= 0).all(-1) & (pixels[:, 0] < camera.width) & (pixels[:, 1] < camera.height)
+    return pixels, depths, front & inside
 
 
 def _random_points(

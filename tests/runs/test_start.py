@@ -85,6 +85,35 @@ def test_too_few_points_are_filled_up_inside_the_views(recording) -> None:
         assert ((image[:, 0] / image[:, 2] > -0.01) & (image[:, 0] / image[:, 2] < 96.01)).all()
 
 
+def test_what_one_camera_alone_sees_begins_at_the_depth_of_what_stands_around_it(recording) -> None:
+    points = surface_points(recording, 300)
+    extent = scene_extent(recording, CAMERAS, points)
+
+    def begin(known: int, cameras: tuple[str, ...] = CAMERAS) -> np.ndarray:
+        sparse = TimedPoints(points[:known], np.full((known, 3), 0.5), np.zeros(known))
+        return initial_points(recording, cameras, sparse, extent, minimum=known + 400).positions[known:]
+
+    def seen(name: str, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        camera = recording.cameras[name]
+        local = positions @ camera.T_camera_world[:3, :3].T + camera.T_camera_world[:3, 3]
+        pixels = (local @ camera.K.T)[:, :2] / local[:, 2:]
+        inside = (local[:, 2] > 0) & (pixels > 0).all(-1) & (pixels < [camera.width, camera.height]).all(-1)
+        return pixels, local[:, 2], inside
+
+    drawn, placed = begin(50), begin(300)  # the former are too few to say anything
+    for own, other, rows in (("train0", "train1", slice(0, 200)), ("train1", "train0", slice(200, 400))):
+        before, after = seen(own, drawn[rows]), seen(own, placed[rows])
+        alone = ~seen(other, drawn[rows])[2]
+        assert alone.any()
+        assert not alone.all()
+        np.testing.assert_allclose(after[0], before[0], atol=1e-9)  # on the ray of its pixel as before
+        np.testing.assert_array_equal(placed[rows][~alone], drawn[rows][~alone])
+        _, depths, inside = seen(own, points)
+        apart = np.abs(after[1][alone][:, None] / depths[inside][None] - 1)
+        np.testing.assert_allclose(apart.min(1), 0, atol=1e-12)
+    np.testing.assert_array_equal(begin(50, CAMERAS[:1]), begin(300, CAMERAS[:1]))  # one camera: no second opinion
+
+
 def test_the_same_seed_gives_the_same_start(recording) -> None:
     sparse = TimedPoints(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
     extent = scene_extent(recording, CAMERAS, sparse.positions)
