@@ -10,15 +10,20 @@ import logging
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from d2_plugin.errors import unknown_name
 from d2_plugin.protocol import EXPORT_FILE, DepthPrior
 from d2_plugin.reading import field, parsing, read_json
-from d2_plugin.store.store import PriorStore, other_recording
+from d2_plugin.store.store import PriorStore
 from d2_plugin.values import fitting
 
 log = logging.getLogger(__name__)
 
 REMEDY = "give the folder that `d2 export-recording` wrote"
+
+SIZE_ROUNDED = 0.01
+"""Of the width or height: how far halving an odd number of pixels may move a lens."""
 
 
 class RenamedStore:
@@ -116,8 +121,16 @@ def is_source_of(store: Any, folder: Path) -> bool:
     recording decides.
     """
     about, described = getattr(store, "about", None) or {}, read_json(folder / EXPORT_FILE, REMEDY)
-    source = {"calibrations": described.get("calibrations"), "recording": described.get("source")}
-    if not source["calibrations"] or not about.get("calibrations") or other_recording(about, source) is not None:
+    ours, theirs = (part.get("calibrations") or {} for part in (about, described))
+    shared = ours.keys() & theirs.keys()
+    if not shared or not all(_same_at_any_size(ours[name], theirs[name]) for name in shared):
         return False
     kept = all(name == exported for name, exported in described.get("cameras", {}).items())
-    return not kept or about.get("recording") == source["recording"]
+    return not kept or about.get("recording") == described.get("source")
+
+
+def _same_at_any_size(ours: dict[str, Any], theirs: dict[str, Any]) -> bool:
+    """Whether two calibrations are of one camera; trainers that halve images want a prior of half the export's size."""
+    lenses = [np.asarray(one["K"], float)[:2] / np.asarray(one["size"], float)[:, None] for one in (ours, theirs)]
+    poses = [np.asarray(one["T_camera_world"], float) for one in (ours, theirs)]
+    return np.allclose(*lenses, atol=SIZE_ROUNDED) and np.allclose(*poses, rtol=1e-6, atol=1e-9)
