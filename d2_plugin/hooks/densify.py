@@ -198,7 +198,8 @@ class Densify(Hook):
         room = most - len(context.backbone)
         if room <= 0 and not self._full:
             self._full = True
-            log.warning("step %d: %d Gaussians, so none are inserted: max_gaussians = %d", context.step, most - room, most)
+            count = len(context.backbone)
+            log.warning("step %d: %d Gaussians, so none are inserted: max_gaussians = %d", context.step, count, most)
         inserted: list[Points] = []
         for surveyed, lives in (
             *((surveyed, self._lifetimes(surveyed.view, context)) for surveyed in context.evaluation),
