@@ -22,9 +22,6 @@ log = logging.getLogger(__name__)
 
 REMEDY = "give the folder that `d2 export-recording` wrote"
 
-SIZE_ROUNDED = 0.01
-"""Of the width or height: how far halving an odd number of pixels may move a lens."""
-
 
 class RenamedStore:
     """The priors of the source recording under the names of its export."""
@@ -130,7 +127,10 @@ def is_source_of(store: Any, folder: Path) -> bool:
 
 
 def _same_at_any_size(ours: dict[str, Any], theirs: dict[str, Any]) -> bool:
-    """Whether two calibrations are of one camera; trainers that halve images want a prior of half the export's size."""
+    """Whether two calibrations are of one camera: a trainer that halves images has a prior of half the export's size.
+
+    Lenses in units of the size may differ by what halving an odd number of pixels does.
+    """
     lenses = [np.asarray(one["K"], float)[:2] / np.asarray(one["size"], float)[:, None] for one in (ours, theirs)]
     poses = [np.asarray(one["T_camera_world"], float) for one in (ours, theirs)]
-    return np.allclose(*lenses, atol=SIZE_ROUNDED) and np.allclose(*poses, rtol=1e-6, atol=1e-9)
+    return np.allclose(*lenses, atol=0.01) and np.allclose(*poses, rtol=1e-6, atol=1e-9)
