@@ -131,6 +131,6 @@ def _same_at_any_size(ours: dict[str, Any], theirs: dict[str, Any]) -> bool:
 
     Lenses in units of the size may differ by what halving an odd number of pixels does.
     """
-    lenses = [np.asarray(one["K"], float)[:2] / np.asarray(one["size"], float)[:, None] for one in (ours, theirs)]
-    poses = [np.asarray(one["T_camera_world"], float) for one in (ours, theirs)]
-    return np.allclose(*lenses, atol=0.01) and np.allclose(*poses, rtol=1e-6, atol=1e-9)
+    lens, other = (np.asarray(one["K"])[:2] / np.asarray(one["size"])[:, None] for one in (ours, theirs))
+    same_pose = np.allclose(ours["T_camera_world"], theirs["T_camera_world"], rtol=1e-6, atol=1e-9)
+    return same_pose and np.allclose(lens, other, atol=0.01)
