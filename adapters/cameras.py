@@ -14,11 +14,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from d2_plugin.errors import D2Error
 from d2_plugin.protocol import View
 
 from .keys import PriorKey
-from .shared import optional
 
 
 def inria_view(camera: Any, key: PriorKey, time: float, like: Tensor) -> View:
@@ -42,23 +40,11 @@ def intrinsics(camera: Any, width: int, height: int) -> Tensor:
     From the projection P (clip = P camera, w = z): f_x = P_00 W / 2 and c_x = (P_02 + 1) W / 2, rows alike. It is made
     where P is, so that nothing waits for a GPU.
     """
-    projection = optional(camera, "projection_matrix")
-    if projection is not None:
-        P = projection.detach().T.double()
-        K = torch.eye(3, dtype=torch.float64, device=P.device)
-        for row, half in enumerate((width / 2, height / 2)):
-            K[row, row] = P[row, row] * half
-            K[row, 2] = (P[row, 2] + 1) * half
-    else:
-        angles = float(camera.FoVx), float(camera.FoVy)
-        if min(angles) <= 0:
-            raise D2Error(
-                f"camera '{camera.image_name}' has fields of view {angles[0]:g}, {angles[1]:g} and no projection "
-                "matrix: give it one of the two"
-            )
-        focal_x, focal_y = (size / 2 / math.tan(angle / 2) for size, angle in zip((width, height), angles))
-        rows = [[focal_x, 0, width / 2], [0, focal_y, height / 2], [0, 0, 1]]
-        K = torch.tensor(rows, dtype=torch.float64)
+    P = camera.projection_matrix.detach().T.double()
+    K = torch.eye(3, dtype=torch.float64, device=P.device)
+    for row, half in enumerate((width / 2, height / 2)):
+        K[row, row] = P[row, row] * half
+        K[row, 2] = (P[row, 2] + 1) * half
     return K
 
 

@@ -40,9 +40,6 @@ from .shared import (
 ROWS = "d2_rows"
 """The column in the strategy's state: the number of each row plus one, since gsplat marks what is new with zeros."""
 
-NO_ROWS = {"binoms"}
-"""Tensors in a strategy's state that have no row per Gaussian (MCMC's table of binomials)."""
-
 GSPLAT = RasterSettings(near=0.01)
 """Of gsplat's rasterizer, where the user does not change them."""
 
@@ -210,7 +207,7 @@ class GsplatAdapter(Resizing):
     def _change_state(self, change: Callable[[Tensor], Tensor], index: Tensor) -> None:
         state = {} if self.state is None else self.state
         for key, value in state.items():
-            if isinstance(value, Tensor) and key not in NO_ROWS and value.shape[:1] == (self._known,):
+            if isinstance(value, Tensor) and key != "binoms" and value.shape[:1] == (self._known,):
                 state[key] = change(value)
         self._renumber()
         self._report(index)

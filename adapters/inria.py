@@ -101,11 +101,10 @@ class InriaAdapter(Resizing, ABC):
             camera, package = camera.camera, camera.package
         if isinstance(camera, View):
             return on_device(camera, self.gaussians._xyz)
-        if not hasattr(camera, "world_view_transform"):
-            raise D2Error(
-                f"a camera of type {type(camera).__name__} has no world_view_transform: pass the trainer's own camera "
-                "object, or a d2_plugin View"
-            )
+        for name in ("world_view_transform", "projection_matrix"):
+            if optional(camera, name) is None:
+                kind = type(camera).__name__
+                raise D2Error(f"a camera of type {kind} has no {name}: pass the trainer's own, or a d2_plugin View")
         view = inria_view(camera, self._key_of(camera), self._time(camera), self.gaussians._xyz)
         if package is not None:
             self._renders.put(view, package)

@@ -46,10 +46,11 @@ def test_without_a_cap_nothing_of_the_trainers_is_removed() -> None:
     assert "max_gaussians" not in d2.log.summary()
 
 
-def test_what_was_there_before_stays_where_the_cap_is_below_it() -> None:
+def test_what_was_there_before_stays_where_the_cap_is_below_it(caplog: pytest.LogCaptureFixture) -> None:
     before = len(make_adapter(make_model()))
     _, counts = grown(before - 5)
     assert counts == [before] * 4
+    assert f"step 1: {before + 10} Gaussians, so none are inserted: max_gaussians = {before - 5}" in caplog.text
 
 
 def test_the_faintest_of_the_newest_go() -> None:

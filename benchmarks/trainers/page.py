@@ -23,6 +23,7 @@ HEADER = (
     "of what moves",
     "Gaussians",
     "D2 +/-",
+    "CPU s",
     "worst",
 )
 
@@ -66,6 +67,7 @@ def _line(case: tuple, rows: list[Row]) -> tuple[str, ...]:
         *(_spread(gains, sign="+"), _moving(bare, attached)),
         " → ".join(_mean(some, "gaussians") for some in (bare, attached)),
         " / ".join(_mean(attached, name) for name in ("inserted", "removed")),
+        " → ".join(_mean(some, "cpu_seconds") for some in (bare, attached)),
         worst(bare, attached),
     )
 
@@ -84,7 +86,8 @@ def _moving(bare: Sequence[Row], attached: Sequence[Row]) -> str:
 
 
 def _mean(rows: Sequence[Row], name: str) -> str:
-    return str(round(mean(row[name] for row in rows))) if rows else "-"
+    known = [row[name] for row in rows if name in row]
+    return str(round(mean(known))) if known else "-"
 
 
 def last(row: Row) -> float:

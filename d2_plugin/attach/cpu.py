@@ -11,7 +11,6 @@ from torch.overrides import TorchFunctionMode
 log = logging.getLogger(__name__)
 
 _NOTHING = ("empty_cache", "synchronize", "set_device", "reset_peak_memory_stats")
-_TYPES = ("FloatTensor", "DoubleTensor", "HalfTensor", "IntTensor", "LongTensor", "ByteTensor", "BoolTensor")
 _ZERO = ("memory_allocated", "max_memory_allocated", "memory_reserved", "max_memory_reserved")
 
 
@@ -47,8 +46,6 @@ def run_on_cpu() -> None:
         setattr(torch.cuda, name, lambda *_, **__: None)
     for name in _ZERO:
         setattr(torch.cuda, name, lambda *_, **__: 0)
-    for name in _TYPES:
-        setattr(torch.cuda, name, getattr(torch, name))
     torch.cuda.current_device = lambda: 0
     torch.cuda.device_count = lambda: 0
     torch.cuda.is_available = lambda: False

@@ -63,13 +63,7 @@ class ToTensor:
 
 
 class ToPILImage:
-    """A tensor [C, H, W] in 0..1 as a PIL image."""
-
-    def __call__(self, pic: Tensor) -> Any:
-        """The image."""
-        from PIL import Image
-
-        return Image.fromarray((pic.detach().cpu() * 255).byte().permute(1, 2, 0).contiguous().numpy())
+    """4DGaussians makes one (scene/dataset_readers.py:403) and calls it nowhere."""
 
 
 class NoLpips(torch.nn.Module):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,6 +16,8 @@ from d2_plugin.hooks.hook import Context, Hook, HookConfig, Surveyed, steps_betw
 from d2_plugin.hooks.rendered_depth import relative_discrepancy, rendered_depth
 from d2_plugin.protocol import DepthPrior, Edit, Label, Points, Splats, View
 from d2_plugin.settings import Count, Every, Positive, Range, Share, Steps
+
+log = logging.getLogger(__name__)
 
 AT_LEAST = 5
 """Steps from one evaluation to the next in a short run: an evaluation costs as much as several steps."""
@@ -187,11 +190,16 @@ class Densify(Hook):
     def __init__(self, config: DensifyConfig) -> None:
         super().__init__(config)
         self._moving = MovingPixels()
+        self._full = False
 
     def edit(self, context: Context) -> Edit | None:
         """Points from the under-reconstructed pixels of the evaluated views, within the budget."""
-        most = self.config.max_gaussians
-        room = (MOST if most is None else most) - len(context.backbone)
+        most = MOST if self.config.max_gaussians is None else self.config.max_gaussians
+        room = most - len(context.backbone)
+        if room <= 0 and not self._full:
+            self._full = True
+            count = len(context.backbone)
+            log.warning("step %d: %d Gaussians, so none are inserted: max_gaussians = %d", context.step, count, most)
         inserted: list[Points] = []
         for surveyed, lives in (
             *((surveyed, self._lifetimes(surveyed.view, context)) for surveyed in context.evaluation),

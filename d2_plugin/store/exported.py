@@ -10,10 +10,12 @@ import logging
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from d2_plugin.errors import unknown_name
 from d2_plugin.protocol import EXPORT_FILE, DepthPrior
 from d2_plugin.reading import field, parsing, read_json
-from d2_plugin.store.store import PriorStore, other_recording
+from d2_plugin.store.store import PriorStore
 from d2_plugin.values import fitting
 
 log = logging.getLogger(__name__)
@@ -116,8 +118,19 @@ def is_source_of(store: Any, folder: Path) -> bool:
     recording decides.
     """
     about, described = getattr(store, "about", None) or {}, read_json(folder / EXPORT_FILE, REMEDY)
-    source = {"calibrations": described.get("calibrations"), "recording": described.get("source")}
-    if not source["calibrations"] or not about.get("calibrations") or other_recording(about, source) is not None:
+    ours, theirs = (part.get("calibrations") or {} for part in (about, described))
+    shared = ours.keys() & theirs.keys()
+    if not shared or not all(_same_at_any_size(ours[name], theirs[name]) for name in shared):
         return False
     kept = all(name == exported for name, exported in described.get("cameras", {}).items())
-    return not kept or about.get("recording") == source["recording"]
+    return not kept or about.get("recording") == described.get("source")
+
+
+def _same_at_any_size(ours: dict[str, Any], theirs: dict[str, Any]) -> bool:
+    """Whether two calibrations are of one camera: a trainer that halves images has a prior of half the export's size.
+
+    Lenses in units of the size may differ by what halving an odd number of pixels does.
+    """
+    lens, other = (np.asarray(one["K"])[:2] / np.asarray(one["size"])[:, None] for one in (ours, theirs))
+    same_pose = np.allclose(ours["T_camera_world"], theirs["T_camera_world"], rtol=1e-6, atol=1e-9)
+    return same_pose and np.allclose(lens, other, atol=0.01)

@@ -41,13 +41,11 @@ class TestFieldsOfView:
         moved = type(camera)(View("c", 0, 0.0, view.T_camera_world, K, 32, 24), torch.zeros(24, 32, 3), by_focal=True)
         torch.testing.assert_close(intrinsics(moved, 32, 24).float(), K)
 
-    def test_without_a_projection_they_come_from_the_angles(self) -> None:
+    def test_a_camera_without_a_projection_is_refused(self) -> None:
         camera = cameras_of()[0]
         camera.projection_matrix = None
-        torch.testing.assert_close(intrinsics(camera, 32, 24).float(), make_views()[0].K)
-        camera.FoVx = -1.0
-        with pytest.raises(D2Error, match="fields of view -1"):
-            intrinsics(camera, 32, 24)
+        with pytest.raises(D2Error, match="has no projection_matrix: pass the trainer's own"):
+            FudanAdapter(fudan.make()[0]).view(camera)
 
     def test_minus_one_is_corrected_where_a_hook_is_on_and_left_alone_where_none_is(self) -> None:
         for config, corrected in ((D2Config(), False), (DEPTH_ALONE, True)):

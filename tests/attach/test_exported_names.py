@@ -71,6 +71,19 @@ def test_the_configuration_and_the_launcher_find_it_too(exported) -> None:
     assert export_read(exported.prior, exported.folder.parent) is None
 
 
+def test_a_prior_of_half_the_size_finds_its_names_too(exported, tmp_path: Path) -> None:
+    about = describe_recording(exported.recording)
+    for camera in about["calibrations"].values():
+        width, height = camera["size"]
+        camera["size"] = [width // 2, height // 2]
+        camera["K"] = [[value / 2 for value in row] for row in camera["K"][:2]] + [[0, 0, 1]]
+    PriorStore.create(tmp_path / "half", [*exported.recording.cameras], exported.recording.frames, about)
+    assert export_read(tmp_path / "half", exported.folder / "colmap_0") == exported.folder
+    next(iter(about["calibrations"].values()))["T_camera_world"][0][3] += 0.1
+    PriorStore.create(tmp_path / "moved", [*exported.recording.cameras], exported.recording.frames, about)
+    assert export_read(tmp_path / "moved", exported.folder / "colmap_0") is None
+
+
 def test_an_unknown_name_says_the_way_out(exported) -> None:
     with pytest.raises(D2Error, match=r"unknown camera of the prior store 'cam09'.*`exported`.*function `key`"):
         PriorStore.open(exported.prior).prior("cam09", 0)
