@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 import torch
 from numpy.lib.stride_tricks import sliding_window_view
-from tiny import TinyStore, make_adapter, make_model, make_views
+from tiny import BACKBONES, TinyStore, make_adapter, make_model, make_views
 from torch import Tensor
 
 from benchmarks.rivals.dense_start import back_projected
 from benchmarks.rivals.inputs import expected_depth
-from benchmarks.rivals.patch_norm import patch_norm_loss
+from benchmarks.rivals.patch_norm import PatchNorm, PatchNormConfig, hard_and_soft, patch_norm_loss
 from benchmarks.rivals.pearson import PearsonConfig, pearson_depth_loss
 from benchmarks.rivals.scale_shift import scale_shift_loss
 from benchmarks.rivals.sparse_points import Seen, sparse_point_loss
@@ -24,6 +24,8 @@ from benchmarks.rivals.table import RIVAL_PRESETS, RIVALS, guidance
 from d2_plugin import D2Config, D2Hooks
 from d2_plugin.errors import D2Error
 from d2_plugin.hooks import Context, Hook, HookConfig
+from d2_plugin.hooks.prior import PriorLoader
+from d2_plugin.protocol import View
 from d2_plugin.recordings.export.folder import save_recording
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.runs.ablation.ablate import ablate
@@ -161,6 +163,44 @@ def test_patch_norm_of_constant_and_tiny_maps_has_finite_gradients(
     loss.backward()
     assert loss.isfinite()
     assert d.grad.isfinite().all()
+
+
+class OneMap:
+    """What `Inputs` knows of depth: a slope."""
+
+    def inverse_depth(self, view: View) -> Tensor:
+        return torch.linspace(1, 2, view.width).expand(view.height, -1)
+
+
+@pytest.mark.parametrize("backbone", BACKBONES)
+@pytest.mark.parametrize(
+    ("soft_start", "wanted"), [(10, {"positions"}), (0, {"positions", "opacity_logits"})], ids=["hard", "and soft"]
+)
+def test_hard_depth_moves_centres_and_soft_depth_fades_gaussians_and_nothing_else_learns(
+    backbone: str, soft_start: int, wanted: set[str]
+) -> None:
+    """DNGaussian's code freezes all but positions for one term, and all but opacities for the other."""
+    adapter = make_adapter(make_model(backbone=backbone))
+    hook = PatchNorm(PatchNormConfig(soft_start=soft_start), OneMap())
+    context = Context(5, adapter, make_views()[:1], PriorLoader(TinyStore()), torch.Generator().manual_seed(0))
+    loss = hook.loss(context)
+    assert loss is not None
+    loss.backward()
+    trained = adapter.trained()
+    assert {name for name, value in trained.items() if value.grad is not None and value.grad.any()} == wanted
+
+
+@pytest.mark.parametrize("backbone", BACKBONES)
+def test_hard_depth_draws_what_ends_fainter(backbone: str) -> None:
+    """A Gaussian of another instant is no solid surface at this one."""
+    adapter, view = make_adapter(make_model(backbone=backbone)), make_views()[0]
+    splats = adapter.slice_at(view)
+    alive = splats.opacities / adapter.trained()["opacity_logits"][splats.rows].sigmoid()
+    hard, soft = hard_and_soft(adapter, view, 0.95)
+    assert alive.min() < 0.999
+    torch.testing.assert_close(hard.opacities, 0.95 * alive)
+    torch.testing.assert_close(soft.opacities, splats.opacities)
+    assert torch.equal(hard.means, splats.means)
 
 
 def test_pixels_without_a_map_do_not_count() -> None:
