@@ -34,7 +34,9 @@ def never_worse(rows: Sequence[Row]) -> Section:
 
 def rivals_swept(rows: Sequence[Row]) -> Section:
     """Each rival as published and at its best, by a sweep of weight and schedule."""
-    return _section("sweep", "Rivals at their best", sweep_of_rivals.CAPTION, rows, {}, [("Swept", sweep_of_rivals.table(rows))])
+    return _section(
+        "sweep", "Rivals at their best", sweep_of_rivals.CAPTION, rows, {}, [("Swept", sweep_of_rivals.table(rows))]
+    )
 
 
 def alignment(rows: Sequence[Row]) -> Section:
@@ -111,7 +113,13 @@ def _section(name: str, title: str, text: str, rows: Sequence[Row], figures: dic
 
 
 EVERY = BUILDERS | {
-    **{"sweep": rivals_swept, "never_worse": never_worse, "alignment": alignment, "stereo": stereo_depth, "priors": priors},
+    **{
+        "sweep": rivals_swept,
+        "never_worse": never_worse,
+        "alignment": alignment,
+        "stereo": stereo_depth,
+        "priors": priors,
+    },
     **{"raster": rasterizer, "step": step, "gpu": gpu, "stability": stability, "scaling": growth},
 }
 """What makes the section of each kind of row, in the order of the page."""

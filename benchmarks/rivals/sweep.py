@@ -113,7 +113,8 @@ def table(rows: Sequence[Row]) -> Table:
     cells = []
     for name in dict.fromkeys(row["method"] for row in rows):
         best, published = best_change(rows, name), "" if name == "backbone" else str(PUBLISHED)
-        scores = [f"{psnr[name, change, case]:.2f}" for case in cases for change in (published, best)]
+        found = [psnr.get((name, change, case)) for case in cases for change in (published, best)]
+        scores = ["-" if value is None else f"{value:.2f}" for value in found]
         mine = [row for row in rows if row["method"] == name]
         cells.append((name, best, *scores, str(len(mine)), f"{sum(row['seconds'] for row in mine):.0f}"))
     return Table((*titles, "runs", "CPU s"), tuple(cells))

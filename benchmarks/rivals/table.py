@@ -14,7 +14,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
-from benchmarks.rivals.dense_start import DenseStartConfig, dense_points
+from benchmarks.rivals.dense_start import DenseStartConfig, dense_points, feed_forward_points
 from benchmarks.rivals.inputs import Inputs
 from benchmarks.rivals.patch_norm import PatchNorm, PatchNormConfig
 from benchmarks.rivals.pearson import Pearson, PearsonConfig
@@ -24,7 +24,7 @@ from d2_plugin.hooks import Hook
 from d2_plugin.priors.monocular.network import MonocularModel
 from d2_plugin.runs.ablation.presets import PRESETS, TABLES, Preset
 from d2_plugin.runs.scene import Scene
-from d2_plugin.runs.settings import RunSettings, check
+from d2_plugin.runs.settings import HOOK_NAMES, RunSettings, check
 from d2_plugin.runs.start import TimedPoints
 from d2_plugin.runs.training import bench
 
@@ -119,6 +119,13 @@ RIVALS: dict[str, Rival] = {
     ),
 }
 
+STARTS = {
+    "feed_forward": Rival(
+        *("Feed-forward start, emulated", "stereo", lambda iterations: DenseStartConfig()), start=feed_forward_points
+    ),
+}
+"""No rival but a good start, from which the backbone alone and D² are trained."""
+
 
 @dataclass(frozen=True)
 class RivalGuidance:
@@ -133,18 +140,18 @@ class RivalGuidance:
 
     def start(self, scene: Scene, points: TimedPoints, priors: Path) -> TimedPoints:
         """Its own points where it brings some, else the triangulated ones."""
-        start = RIVALS[self.name].start
+        start = (RIVALS | STARTS)[self.name].start
         return points if start is None else start(Inputs(scene, points, priors), self.config)
 
     def hooks(self, scene: Scene, points: TimedPoints, priors: Path) -> Mapping[str, Hook]:
         """Its hook, if it has one."""
-        hook = RIVALS[self.name].hook
+        hook = (RIVALS | STARTS)[self.name].hook
         return {} if hook is None else {self.name: hook(self.config, Inputs(scene, points, priors))}
 
 
 def guidance(name: str, iterations: int, change: Change = PUBLISHED) -> RivalGuidance:
     """The rival of that name for a run of so many steps, as published but for the change."""
-    return RivalGuidance(name, change.of(RIVALS[name].config(iterations), iterations))
+    return RivalGuidance(name, change.of((RIVALS | STARTS)[name].config(iterations), iterations))
 
 
 def prior_seconds(needs: Needs, settings: RunSettings, full: float | None) -> float | None:
@@ -167,11 +174,11 @@ def monocular_seconds(settings: RunSettings) -> float:
     return (time.process_time() - start) * len(scene.train_cameras) * len(scene.recording.frames)
 
 
-def preset(name: str, change: Change = PUBLISHED, label: str = "") -> Preset:
-    """A rival as a row of a comparison; `label` stands behind its name."""
-    rival = RIVALS[name]
+def preset(name: str, change: Change = PUBLISHED, label: str = "", hooks: tuple[str, ...] = ()) -> Preset:
+    """A rival as a row of a comparison, with D²'s `hooks` beside it; `label` stands behind its name."""
+    rival = (RIVALS | STARTS)[name]
     return Preset(
-        *(name + label, rival.title, ()),
+        *(name + label, rival.title, hooks),
         overrides=rival.tables if change.tables is None else change.tables,
         guidance=partial(guidance, name, change=change),
         prior_seconds=partial(prior_seconds, rival.needs),
@@ -179,10 +186,8 @@ def preset(name: str, change: Change = PUBLISHED, label: str = "") -> Preset:
 
 
 RIVAL_PRESETS = {
-    made.name: made
-    for name, rival in RIVALS.items()
-    for made in (preset(name), preset(name, rival.best, "_best"))
-}
+    made.name: made for name, rival in RIVALS.items() for made in (preset(name), preset(name, rival.best, "_best"))
+} | {"feed_forward": preset("feed_forward"), "feed_forward_d2": preset("feed_forward", label="_d2", hooks=HOOK_NAMES)}
 
 
 @dataclass(frozen=True)
@@ -191,11 +196,12 @@ class RivalsBench(bench.TrainingBench):
 
     methods: tuple[str, ...] = ("rivals",)
     """Rows or tables of `d2 ablate`, and rivals; `rivals` stands for the backbone, all of them and D²,
-    `rivals_best` for the same with each rival at its best."""
+    `rivals_best` for the same with each rival at its best, `starts` for an emulated feed-forward start."""
 
 
 def run(settings: RivalsBench) -> str:
     """Measure what is missing; where the rows lie."""
     best = tuple(f"{name}_best" for name in RIVALS)
     tables = TABLES | {"rivals": ("backbone", *RIVALS, "full"), "rivals_best": ("backbone", *best, "full")}
+    tables |= {"starts": ("backbone", "feed_forward", "feed_forward_d2", "full")}
     return bench.run(settings, PRESETS | RIVAL_PRESETS, tables, "bench rivals")

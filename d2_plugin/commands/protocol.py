@@ -65,7 +65,9 @@ def run(settings: ProtocolRun) -> str:
         "metrics": {name: VARIANTS[name] for name in protocol.metrics},
         "differs": list(differences(protocol, used, train, iterations)),
     }
-    chosen = {name: getattr(settings, name) for name in ("methods", "seeds", "mono_onnx", "mono_kind", "jobs", "output")}
+    chosen = {
+        name: getattr(settings, name) for name in ("methods", "seeds", "mono_onnx", "mono_kind", "jobs", "output")
+    }
     of_bench = bench.TrainingBench(
         recordings=(f"{path}@{protocol.cameras}",), steps=(iterations,), frames=frames, downscale=factor, **chosen
     )

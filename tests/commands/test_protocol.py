@@ -1,4 +1,4 @@
-"""`d2 protocol`: a published evaluation is one command, says what is not as published, and repeats to the last digit."""
+"""`d2 protocol`: a published evaluation is one command; it says what differs, and repeats to the last digit."""
 
 from __future__ import annotations
 
@@ -53,9 +53,7 @@ def test_a_protocol_says_what_differs_and_repeats_to_the_last_digit(scene: Path,
     assert "intrinsics" not in printed
 
 
-def test_what_is_there_is_not_measured_again(
-    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_is_there_is_not_measured_again(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["protocol", "4c4d", str(scene), "--iterations", "2", "--methods", "backbone", "--jobs", "1"]
     for _ in range(2):
         assert main([*words, "--output", str(tmp_path)]) == 0
@@ -92,9 +90,7 @@ def test_every_protocol_has_cameras_and_metrics_that_there_are(name: str, scene:
     ("words", "said"),
     [(("gc-4dgs4", "x"), "did you mean 'gc-4dgs-4'"), (("4c4d", "a@b/c"), "rename a folder"), (("4c4d",), "needs")],
 )
-def test_what_cannot_be_is_one_sentence(
-    words: tuple[str, ...], said: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_cannot_be_is_one_sentence(words: tuple[str, ...], said: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["protocol", *words]) == 2
     error = capsys.readouterr().err
     assert said in error
