@@ -14,13 +14,14 @@ from numpy.lib.stride_tricks import sliding_window_view
 from tiny import BACKBONES, TinyStore, make_adapter, make_model, make_views
 from torch import Tensor
 
-from benchmarks.rivals.dense_start import back_projected
+from benchmarks.rivals.dense_start import DenseStartConfig, back_projected
 from benchmarks.rivals.inputs import expected_depth
 from benchmarks.rivals.patch_norm import PatchNorm, PatchNormConfig, hard_and_soft, patch_norm_loss
 from benchmarks.rivals.pearson import PearsonConfig, pearson_depth_loss
 from benchmarks.rivals.scale_shift import scale_shift_loss
 from benchmarks.rivals.sparse_points import Seen, sparse_point_loss
-from benchmarks.rivals.table import RIVAL_PRESETS, RIVALS, guidance
+from benchmarks.rivals.sweep import best_change
+from benchmarks.rivals.table import RIVAL_PRESETS, RIVALS, Change, guidance
 from d2_plugin import D2Config, D2Hooks
 from d2_plugin.errors import D2Error
 from d2_plugin.hooks import Context, Hook, HookConfig
@@ -30,6 +31,7 @@ from d2_plugin.recordings.export.folder import save_recording
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.runs.ablation.ablate import ablate
 from d2_plugin.runs.ablation.presets import PRESETS, rows_named
+from d2_plugin.runs.rows import read_rows
 from d2_plugin.runs.run import Run
 from d2_plugin.runs.saved import read_run
 from d2_plugin.runs.settings import RunSettings
@@ -325,6 +327,35 @@ class TestOnARecording:
         for other in (guidance("scale_shift", 24), None, stronger):
             with pytest.raises(D2Error, match="other settings of guidance"):
                 Run(run.settings, folder, other)
+
+
+class TestAtTheirBest:
+    def test_a_change_scales_the_weight_and_ends_the_loss(self) -> None:
+        changed = Change(0.1, 0.5).of(PearsonConfig.for_iterations(400), 400)
+        assert changed.weight == pytest.approx(0.005)
+        assert changed.window.due(200)
+        assert not changed.window.due(201)
+        assert Change(2.0).of(DenseStartConfig(), 400).density == pytest.approx(0.36)
+        assert str(Change(0.1, 0.5)) == "0.1 times, first 50%"
+
+    @pytest.mark.parametrize("name", RIVALS)
+    def test_the_best_is_that_of_the_sweep(self, name: str) -> None:
+        """No weight of a table is chosen by hand."""
+        rows = read_rows([Path(__file__).parents[2] / "docs" / "results" / "rivals-sweep.jsonl"])
+        assert str(RIVALS[name].best) == best_change(rows, name)
+
+    def test_an_emulated_feed_forward_start_covers_every_pixel_alike(self, ablation: Path) -> None:
+        run = run_of(ablation, "dense_start")
+        points = run.prepare()
+        started = guidance("feed_forward", 24).start(run.scene, points, run.priors)
+        assert len(points) + 800 < len(started) <= len(points) + 0.18 * 96 * 54 + 6
+        recording, name = run.scene.recording, run.scene.train_cameras[0]
+        camera, added = recording.cameras[name], started.positions[len(points) :][started.times[len(points) :] == 0]
+        local = added @ camera.T_camera_world[:3, :3].T + camera.T_camera_world[:3, 3]
+        column, row = np.floor((local @ camera.K.T / local[:, 2:])[:, :2]).astype(int).T
+        seen = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height) & (local[:, 2] > 0)
+        wrong = np.abs(local[seen, 2] / recording.depth(name, 0)[row[seen], column[seen]] - 1)
+        assert 0.002 < np.median(wrong) < 0.1
 
 
 class TestHooksAsObjects:
