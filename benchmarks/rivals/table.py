@@ -93,6 +93,7 @@ RIVALS: dict[str, Rival] = {
     "pearson": Rival(
         *("Pearson depth (FSGS)", "mono", PearsonConfig.for_iterations, Pearson),
         swept=(Change(0.03), Change(0.1), Change(0.3), Change(0.3, 0.5), Change(1, 0.5), Change(3)),
+        best=Change(0.03),
     ),
     "scale_shift": Rival(
         *("Scale-and-shift-invariant depth (nerfstudio)", "mono", ScaleShiftConfig.for_iterations, ScaleShift),
@@ -107,15 +108,18 @@ RIVALS: dict[str, Rival] = {
             *(Change(times, until, HARD, {}) for times, until in ((0.01, 1), (0.1, 1), (1, 1), (1, 0.5))),
             Change(0.01, tables={}),
         ),
+        best=Change(0.01, fields=HARD, tables={}),
     ),
     "sparse_points": Rival(
         *("Sparse-point depth (gsplat)", "points", SparsePointsConfig.for_iterations, SparsePointDepth),
         swept=(Change(3), Change(10), Change(10, 0.5), Change(100)),
+        best=Change(3),
     ),
     "dense_start": Rival(
         *("Dense start (GC-4DGS)", "stereo", lambda iterations: DenseStartConfig()),
         start=dense_points,
         swept=(Change(0.5), Change(2), Change(4), Change(fields={"instants": 1})),
+        best=Change(4),
     ),
 }
 
