@@ -63,8 +63,8 @@ def feed_forward_points(inputs: Inputs, config: DenseStartConfig) -> TimedPoints
     recording, names = inputs.scene.recording, inputs.scene.train_cameras
     cameras, depths = [recording.cameras[name] for name in names], dict[tuple[str, int], np.ndarray | None]()
     for frame in recording.frames:
-        true = [recording.depth(name, frame) for name in names]
-        if all(depth is not None for depth in true):
+        true = [depth for name in names if (depth := recording.depth(name, frame)) is not None]
+        if len(true) == len(names):
             maps = emulated_multiview(true, cameras, seed=frame, shrink=1)["depth"]
             depths |= {(name, frame): map_ for name, map_ in zip(names, maps)}
     return _started(inputs, config, depths, "the recording has no true depth to emulate a network from")

@@ -107,7 +107,7 @@ def run(
         done: list[Row] = []
 
         def write(row: Row) -> None:
-            append_rows(path, [row | (about or {})])
+            append_rows(path, [{**row, **(about or {})}])
             done.extend([row] if row["target"] != TRY else [])  # a run that finds a length is beside the count
             bar.update(len(done), f"{row['case']}: {row['method']}, {row['setting']}")
 
