@@ -20,6 +20,7 @@ PARTS = {
     "raster": ModuleCommand("benchmarks.raster", "RasterBench", "the rasterizer: time, memory, precision"),
     "report": ModuleCommand("benchmarks.report", "ReportSettings", "`d2 report` with the rows of all these as well"),
     "rivals": ModuleCommand("benchmarks.rivals.table", "RivalsBench", "D², backbone and rivals at equal time"),
+    "rivals-sweep": ModuleCommand("benchmarks.rivals.sweep", "RivalsSweep", "weight and schedule of each rival"),
     "scaling": ModuleCommand("benchmarks.scaling", "ScalingBench", "priors and training over more frames"),
     "stability": ModuleCommand(
         "benchmarks.stability.sweep", "StabilitySettings", "stiff and extreme cases, in both precisions"

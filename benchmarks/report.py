@@ -11,6 +11,7 @@ from benchmarks import align, raster, scaling, stereo, training_step
 from benchmarks.gpu import proof
 from benchmarks.never_worse import bench as never_worse_bench
 from benchmarks.priors_section import priors
+from benchmarks.rivals import sweep as sweep_of_rivals
 from benchmarks.stability import sweep
 from benchmarks.work_precision import colors_of, work_precision
 from d2_plugin.runs.report import report
@@ -29,6 +30,13 @@ def never_worse(rows: Sequence[Row]) -> Section:
     """D² with wrong monocular maps beside stereo alone and the backbone alone."""
     tables = [("Scores", never_worse_bench.table(rows))]
     return _section("never_worse", "Never worse than without", never_worse_bench.CAPTION, rows, {}, tables)
+
+
+def rivals_swept(rows: Sequence[Row]) -> Section:
+    """Each rival as published and at its best, by a sweep of weight and schedule."""
+    return _section(
+        "sweep", "Rivals at their best", sweep_of_rivals.CAPTION, rows, {}, [("Swept", sweep_of_rivals.table(rows))]
+    )
 
 
 def alignment(rows: Sequence[Row]) -> Section:
@@ -105,7 +113,13 @@ def _section(name: str, title: str, text: str, rows: Sequence[Row], figures: dic
 
 
 EVERY = BUILDERS | {
-    **{"never_worse": never_worse, "alignment": alignment, "stereo": stereo_depth, "priors": priors},
+    **{
+        "sweep": rivals_swept,
+        "never_worse": never_worse,
+        "alignment": alignment,
+        "stereo": stereo_depth,
+        "priors": priors,
+    },
     **{"raster": rasterizer, "step": step, "gpu": gpu, "stability": stability, "scaling": growth},
 }
 """What makes the section of each kind of row, in the order of the page."""

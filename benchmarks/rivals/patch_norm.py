@@ -9,15 +9,17 @@ gradient, and s_P that of all pixels of patches,
 
 Either loss is the mean of the squared difference between the normalised render (sum of w z) and the normalised map
 (flipped, so that it grows with depth), over differences above the tolerance; they add up as 0.1 local + 1 global.
-Hard: every Gaussian is drawn with opacity 0.95, and only centres learn. Soft, from a sixth of the run on (1000 of 6000
-steps): only opacities learn. Published with an optimizer step for each; here they join that of the photometric loss.
-Left out: its smoothness and shape penalties and its neural colours, which are no depth guidance.
+Hard: every Gaussian is drawn with opacity 0.95, and only positions learn. Soft, from a sixth of the run on (1000 of
+6000 steps): only opacities learn. Of a 4D Gaussian neither reaches lifetime or velocity (`hard_and_soft`). Published
+with an optimizer step for each, of the one Adam; here they join that of the photometric loss. What is drawn stands
+before black, as published: s has no gradient, so that the soft loss makes the render fainter wherever it is wrong, and
+before a learnt background nothing would hold against it. Left out: smoothness and shape penalties, neural colours.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Self
+from typing import Annotated, Any, Self
 
 import torch
 import torch.nn.functional as F
@@ -25,7 +27,7 @@ from torch import Tensor
 
 from benchmarks.rivals.inputs import RivalLoss, rendered_again
 from d2_plugin.hooks import Context, HookConfig
-from d2_plugin.protocol import View
+from d2_plugin.protocol import Splats, View
 from d2_plugin.settings import NotNegative, Range, Steps
 
 GUARD = 0.01
@@ -96,6 +98,26 @@ def _deviation(values: Tensor, dim: int | None = None) -> Tensor:
     return torch.where(positive, torch.where(positive, variance, 1).sqrt(), 0)
 
 
+def hard_and_soft(backbone: Any, view: View, hard_opacity: float) -> tuple[Splats, Splats]:
+    """The splats of hard depth, of which positions alone learn, and of soft depth, of which opacities alone do.
+
+    Velocities and lifetimes, which the published 3D Gaussians do not have, learn from neither. A Gaussian that is about
+    to end or begin at this instant is drawn by that much fainter in both.
+
+    Args:
+        backbone: adapter of a bundled backbone, whose `trained` tensors have positions and opacity_logits.
+        view: what is rendered.
+        hard_opacity: of every Gaussian in hard depth, in the middle of its life.
+    """
+    splats, trained = backbone.slice_at(view), backbone.trained()
+    fixed = Splats(*(part.detach() for part in splats))
+    positions = trained["positions"].index_select(0, splats.rows)
+    opacities = trained["opacity_logits"].index_select(0, splats.rows).sigmoid()
+    alive = fixed.opacities / opacities.detach()
+    hard = fixed._replace(means=fixed.means + (positions - positions.detach()), opacities=hard_opacity * alive)
+    return hard, fixed._replace(opacities=alive * opacities)
+
+
 class PatchNorm(RivalLoss):
     """Adds the losses of hard and soft depth for the views of the present step."""
 
@@ -107,12 +129,9 @@ class PatchNorm(RivalLoss):
         if inverse is None:
             return None
         target = -torch.where(inverse.isfinite(), inverse, inverse.nanmean())
-        splats = context.backbone.slice_at(view)
-        solid = torch.full_like(splats.opacities, self.config.hard_opacity)
-        hard = splats._replace(covariances=splats.covariances.detach(), opacities=solid)
+        hard, soft = hard_and_soft(context.backbone, view, self.config.hard_opacity)
         total = self._losses(rendered_again(context, view, hard), target, context.generator)
         if context.step > self.config.soft_start:
-            soft = splats._replace(means=splats.means.detach(), covariances=splats.covariances.detach())
             total = total + self._losses(rendered_again(context, view, soft), target, context.generator)
         return total
 

@@ -42,6 +42,10 @@ COMMANDS: dict[str, str | ModuleCommand] = {
     ),
     "ablate": "ablate",
     "bench": "bench",
+    "protocol": ModuleCommand(
+        *("d2_plugin.commands.protocol", "ProtocolRun"),
+        "A published evaluation on N3DV by its name: its cameras, size, frames, steps and metrics, and what differs.",
+    ),
     "report": ModuleCommand(
         "d2_plugin.runs.report.report", "ReportSettings", "One page of everything measured: plots, tables, images."
     ),

@@ -11,23 +11,27 @@ import numpy as np
 import pytest
 import torch
 from numpy.lib.stride_tricks import sliding_window_view
-from tiny import TinyStore, make_adapter, make_model, make_views
+from tiny import BACKBONES, TinyStore, make_adapter, make_model, make_views
 from torch import Tensor
 
-from benchmarks.rivals.dense_start import back_projected
+from benchmarks.rivals.dense_start import DenseStartConfig, back_projected
 from benchmarks.rivals.inputs import expected_depth
-from benchmarks.rivals.patch_norm import patch_norm_loss
+from benchmarks.rivals.patch_norm import PatchNorm, PatchNormConfig, hard_and_soft, patch_norm_loss
 from benchmarks.rivals.pearson import PearsonConfig, pearson_depth_loss
 from benchmarks.rivals.scale_shift import scale_shift_loss
 from benchmarks.rivals.sparse_points import Seen, sparse_point_loss
-from benchmarks.rivals.table import RIVAL_PRESETS, RIVALS, guidance
+from benchmarks.rivals.sweep import best_change
+from benchmarks.rivals.table import RIVAL_PRESETS, RIVALS, Change, guidance
 from d2_plugin import D2Config, D2Hooks
 from d2_plugin.errors import D2Error
 from d2_plugin.hooks import Context, Hook, HookConfig
+from d2_plugin.hooks.prior import PriorLoader
+from d2_plugin.protocol import View
 from d2_plugin.recordings.export.folder import save_recording
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.runs.ablation.ablate import ablate
 from d2_plugin.runs.ablation.presets import PRESETS, rows_named
+from d2_plugin.runs.rows import read_rows
 from d2_plugin.runs.run import Run
 from d2_plugin.runs.saved import read_run
 from d2_plugin.runs.settings import RunSettings
@@ -163,6 +167,44 @@ def test_patch_norm_of_constant_and_tiny_maps_has_finite_gradients(
     assert d.grad.isfinite().all()
 
 
+class OneMap:
+    """What `Inputs` knows of depth: a slope."""
+
+    def inverse_depth(self, view: View) -> Tensor:
+        return torch.linspace(1, 2, view.width).expand(view.height, -1)
+
+
+@pytest.mark.parametrize("backbone", BACKBONES)
+@pytest.mark.parametrize(
+    ("soft_start", "wanted"), [(10, {"positions"}), (0, {"positions", "opacity_logits"})], ids=["hard", "and soft"]
+)
+def test_hard_depth_moves_centres_and_soft_depth_fades_gaussians_and_nothing_else_learns(
+    backbone: str, soft_start: int, wanted: set[str]
+) -> None:
+    """DNGaussian's code freezes all but positions for one term, and all but opacities for the other."""
+    adapter = make_adapter(make_model(backbone=backbone))
+    hook = PatchNorm(PatchNormConfig(soft_start=soft_start), OneMap())
+    context = Context(5, adapter, make_views()[:1], PriorLoader(TinyStore()), torch.Generator().manual_seed(0))
+    loss = hook.loss(context)
+    assert loss is not None
+    loss.backward()
+    trained = adapter.trained()
+    assert {name for name, value in trained.items() if value.grad is not None and value.grad.any()} == wanted
+
+
+@pytest.mark.parametrize("backbone", BACKBONES)
+def test_hard_depth_draws_what_ends_fainter(backbone: str) -> None:
+    """A Gaussian of another instant is no solid surface at this one."""
+    adapter, view = make_adapter(make_model(backbone=backbone)), make_views()[0]
+    splats = adapter.slice_at(view)
+    alive = splats.opacities / adapter.trained()["opacity_logits"][splats.rows].sigmoid()
+    hard, soft = hard_and_soft(adapter, view, 0.95)
+    assert alive.min() < 0.999
+    torch.testing.assert_close(hard.opacities, 0.95 * alive)
+    torch.testing.assert_close(soft.opacities, splats.opacities)
+    assert torch.equal(hard.means, splats.means)
+
+
 def test_pixels_without_a_map_do_not_count() -> None:
     d = tensor(DEPTH, True)
     pearson_depth_loss(d, tensor(np.where(MASK, MONO, np.nan))).backward()
@@ -285,6 +327,35 @@ class TestOnARecording:
         for other in (guidance("scale_shift", 24), None, stronger):
             with pytest.raises(D2Error, match="other settings of guidance"):
                 Run(run.settings, folder, other)
+
+
+class TestAtTheirBest:
+    def test_a_change_scales_the_weight_and_ends_the_loss(self) -> None:
+        changed = Change(0.1, 0.5).of(PearsonConfig.for_iterations(400), 400)
+        assert changed.weight == pytest.approx(0.005)
+        assert changed.window.due(200)
+        assert not changed.window.due(201)
+        assert Change(2.0).of(DenseStartConfig(), 400).density == pytest.approx(0.36)
+        assert str(Change(0.1, 0.5)) == "0.1 times, first 50%"
+
+    @pytest.mark.parametrize("name", RIVALS)
+    def test_the_best_is_that_of_the_sweep(self, name: str) -> None:
+        """No weight of a table is chosen by hand."""
+        rows = read_rows([Path(__file__).parents[2] / "docs" / "results" / "rivals-sweep.jsonl"])
+        assert str(RIVALS[name].best) == best_change(rows, name)
+
+    def test_an_emulated_feed_forward_start_covers_every_pixel_alike(self, ablation: Path) -> None:
+        run = run_of(ablation, "dense_start")
+        points = run.prepare()
+        started = guidance("feed_forward", 24).start(run.scene, points, run.priors)
+        assert len(points) + 800 < len(started) <= len(points) + 0.18 * 96 * 54 + 6
+        recording, name = run.scene.recording, run.scene.train_cameras[0]
+        camera, added = recording.cameras[name], started.positions[len(points) :][started.times[len(points) :] == 0]
+        local = added @ camera.T_camera_world[:3, :3].T + camera.T_camera_world[:3, 3]
+        column, row = np.floor((local @ camera.K.T / local[:, 2:])[:, :2]).astype(int).T
+        seen = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height) & (local[:, 2] > 0)
+        wrong = np.abs(local[seen, 2] / recording.depth(name, 0)[row[seen], column[seen]] - 1)
+        assert 0.002 < np.median(wrong) < 0.1
 
 
 class TestHooksAsObjects:

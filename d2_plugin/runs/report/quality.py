@@ -155,9 +155,9 @@ def _point(group: Group) -> Point:
     return Point(group.minutes, psnr.mean, f"{note} ({seeds_in_words(psnr.seeds)} seeds)" if psnr.seeds > 2 else note)
 
 
-def scores_table(groups: Sequence[Group]) -> Table:
+def scores_table(groups: Sequence[Group], columns: Sequence[Column] = STUDY_COLUMNS) -> Table:
     """One row per group: scores that any run has, Gaussians and times; the best of a recording and length stand out."""
-    columns = [column for column in STUDY_COLUMNS if any(group.scores(column) for group in groups)]
+    columns = [column for column in columns if any(group.scores(column) for group in groups)]
     titles = (*(column.title for column in columns), *(title for title, _, _ in COSTS))
     cells = []
     for group in groups:

@@ -15,7 +15,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 from d2_plugin.errors import D2Error
 from d2_plugin.progress import progress_bar
@@ -86,6 +86,7 @@ def run(
     presets: Mapping[str, Preset] = PRESETS,
     tables: Mapping[str, Sequence[str]] = TABLES,
     name: str = "bench training",
+    about: Mapping[str, Any] | None = None,
 ) -> str:
     """Measure what is missing; where the rows lie.
 
@@ -93,6 +94,7 @@ def run(
         settings: what is compared, and on what.
         presets, tables: methods by name, and tables of such names, that `settings.methods` may hold.
         name: of the command, as rows have it.
+        about: further fields of every row.
     """
     if not settings.recordings:
         raise D2Error(f"{name} needs a recording with its cameras: write PATH@00+02+05+07")
@@ -105,7 +107,7 @@ def run(
         done: list[Row] = []
 
         def write(row: Row) -> None:
-            append_rows(path, [row])
+            append_rows(path, [{**row, **(about or {})}])
             done.extend([row] if row["target"] != TRY else [])  # a run that finds a length is beside the count
             bar.update(len(done), f"{row['case']}: {row['method']}, {row['setting']}")
 
