@@ -16,7 +16,7 @@ from operator import le
 import numpy as np
 
 from d2_plugin.errors import D2Error
-from d2_plugin.recordings.cameras.calibrating.boards import Board, board_matches
+from d2_plugin.recordings.cameras.calibrating.boards import Board, board_matches, how_often, seen_corners
 from d2_plugin.recordings.cameras.calibrating.bundle import Bundle, Tracks, fitting, join_matches, project, triangulate
 from d2_plugin.recordings.cameras.calibrating.features import (
     Features,
@@ -87,8 +87,14 @@ def solve_rig(
         raise D2Error(f"no intrinsics for camera {unknown[0] if unknown else 'any'}: give size and K of every camera")
     features = {name: of_a_still_camera(_of_one_size(name, taken), tilted=True) for name, taken in images.items()}
     features |= {name: find_features([image], tilted=True) for name, image in (stills or {}).items()}
-    features, corners = (features, {}) if board is None else board_matches(features, images, board)
-    return solve_features(features, intrinsics, tuple(images), corners, focal)
+    if board is None:
+        return solve_features(features, intrinsics, tuple(images), focal=focal)
+    seen = seen_corners(images, board)
+    features, corners = board_matches(features, seen, board)
+    try:
+        return solve_features(features, intrinsics, tuple(images), corners, focal)
+    except D2Error as refused:
+        raise D2Error(f"{refused}; {how_often(seen)}") from None
 
 
 def solve_features(
