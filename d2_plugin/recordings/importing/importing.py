@@ -139,11 +139,11 @@ def _known_rig(
                 f"{calibration} gives cameras {one.name} and {other.name} the identical pose: correct one, or leave "
                 "its video out"
             )
-    wrong, said = _contradiction(turned, cameras) if len(cameras) > 1 else (False, "")
+    wrong, mends, said = _contradiction(turned, cameras) if len(cameras) > 1 else (False, False, "")
     doubt = ""
     if wrong and not settings.accept_calibration:
         doubt = f"{calibration} does not fit the videos: {said}; or give --accept-calibration"
-        if not settings.refine_poses:
+        if not (mends and settings.refine_poses):
             raise D2Error(doubt)
     elif said:
         more = (*more, said)
@@ -164,10 +164,10 @@ def _oriented(path: Path, videos: Mapping[str, VideoFile]) -> tuple[dict[str, Vi
         raise
 
 
-def _contradiction(videos: Mapping[str, VideoFile], cameras: Sequence[CalibratedCamera]) -> tuple[bool, str]:
+def _contradiction(videos: Mapping[str, VideoFile], cameras: Sequence[CalibratedCamera]) -> tuple[bool, bool, str]:
     """What an image near the middle of each video says against the calibration, see `calibration_contradicted`.
 
-    Where turning cameras back mends it, it says which.
+    Between the two whether turning back fewer than half of the cameras mends it; it says which, then.
     """
     indices = {name: {0: decoded_alone(video, len(video.stamps) // 2)} for name, video in videos.items()}
     cuts = {camera.name: Cut(0, 0, *camera.size) for camera in cameras}
@@ -178,7 +178,8 @@ def _contradiction(videos: Mapping[str, VideoFile], cameras: Sequence[Calibrated
     if wrong and "swapped" not in said:
         with suppress(MissingExtra):
             turns = {name: turn for name, turn in check_poses(recording).items() if turn.wrong}
-    return wrong, "; ".join(turns_in_words(turns, turns)) or said
+    mends = 0 < 2 * len(turns) < len(cameras)
+    return wrong, mends, "; ".join(turns_in_words(turns, turns)) if mends else said
 
 
 def _solved(settings: ImportSettings, folder: Path, videos: Mapping[str, VideoFile], report: Report) -> dict[str, Any]:

@@ -14,6 +14,7 @@ LONG_SIDE = 320  # pixels of the images that are compared
 MOVED = 0.5  # of these pixels: a camera was moved. One that stands still is within .1 of them, half a degree is .7
 FEWEST = 12  # features that must have moved together
 CONTRAST = 0.02  # of these, at least: half of OpenCV's
+SPREAD = 0.4  # part of the image's width and height over which these lie, at least: what is held up before a wall does not
 TELLS = 5.0  # levels of 255 by which a pixel must change where the image is moved back, to say whether that is right
 EXPLAINS = 0.6  # share of these that say so, at least: where a person walks the wall behind him does not
 DRIFT = 0.05  # share by which the exposure may change unmentioned
@@ -67,7 +68,10 @@ def _jump(images: np.ndarray, before: Sift, after: Sift) -> float:
     back, inside = cv2.estimateAffinePartial2D(q, p, ransacReprojThreshold=1.0) if len(p) >= FEWEST else (None, None)
     if back is None or inside.sum() < FEWEST:
         return np.nan
-    jump = float(np.median(np.linalg.norm(p - q, axis=1)[inside.ravel() > 0]))
+    p, q = p[inside.ravel() > 0], q[inside.ravel() > 0]
+    if (np.ptp(p, axis=0) < SPREAD * np.array(images[1].shape[::-1])).any():
+        return np.nan
+    jump = float(np.median(np.linalg.norm(p - q, axis=1)))
     moved = cv2.warpAffine(images[1], back, images[1].shape[::-1], borderMode=cv2.BORDER_REPLICATE)
     left, there = (np.abs(one - images[0]) for one in (moved, images[1]))
     tells = np.abs(moved - images[1]) > TELLS
