@@ -59,7 +59,9 @@ class TestFocalLengths:
             solve_features(seen_by(truth, things=60), blind(truth), tuple(truth), focal="each")
 
 
-def held(rig: dict[str, Camera], square: float, moments: int, plain: tuple[int, int] | None = None) -> tuple[dict[str, list[np.ndarray]], Board]:
+def held(
+    rig: dict[str, Camera], square: float, moments: int, plain: tuple[int, int] | None = None
+) -> tuple[dict[str, list[np.ndarray]], Board]:
     """Images of a board at some places, in front of grey."""
     rng = np.random.default_rng(0)
     found: dict[str, list[np.ndarray]] = {name: [] for name in rig}

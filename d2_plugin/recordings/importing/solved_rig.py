@@ -193,8 +193,8 @@ def _images(
     indices = _together(videos, clocks, moments, BOARD_TOGETHER if board else TOGETHER) if clocks else None
     if board and indices is None:
         raise D2Error(
-            "--board is matched at moments that all cameras share, and neither timecode nor sound says which these are: "
-            "give --offsets NAME=FRAMES,..., or none where the cameras started together"
+            "--board is matched at moments that all cameras share, and neither timecode nor sound says which these "
+            "are: give --offsets NAME=FRAMES,..., or none where the cameras started together"
         )
     chosen = indices or {name: spread(range(len(video.stamps)), moments) for name, video in videos.items()}
     frames = VideoFrames(videos, {name: dict(enumerate(places)) for name, places in chosen.items()})
@@ -215,7 +215,7 @@ def _images(
 def _together(
     videos: Mapping[str, VideoFile], clocks: Mapping[str, Clock], moments: int, reach: float
 ) -> dict[str, list[int]] | None:
-    """Frames by camera of moments at which all exposed within `reach` of a frame; None where there are fewer than three."""
+    """Frames by camera of moments at which all exposed within `reach` of a frame; None where fewer than three are."""
     grid = grid_of(videos, clocks)
     frames = list(next(iter(grid.indices.values())))
     apart = {

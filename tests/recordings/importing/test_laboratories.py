@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from calibration_writers import Known, toml
-from recorded import Filmed, Shooting, video
+from recorded import Filmed
 from rigs import arc, cv2, filmed, worst
 
 from d2_plugin.commands.cli import main
@@ -82,9 +82,7 @@ def test_four_webcams_with_a_board_are_placed_in_metres(webcams: tuple, tmp_path
     assert rig_width(found.values()) == pytest.approx(rig_width(truth.values()), rel=0.01)
 
 
-def test_webcams_whose_board_is_hidden_from_one_are_told_so(
-    webcams: tuple, tmp_path: Path, capsys, refused
-) -> None:
+def test_webcams_whose_board_is_hidden_from_one_are_told_so(webcams: tuple, tmp_path: Path, capsys, refused) -> None:
     folder, truth = webcams
     for path in folder.glob("*.avi"):
         (tmp_path / path.name).write_bytes(path.read_bytes())
@@ -127,7 +125,7 @@ def test_xvid_at_wide_angles_is_imported_and_a_turned_camera_named(
 
 @pytest.fixture(scope="module")
 def mouse(tmp_path_factory: pytest.TempPathFactory) -> Filmed:
-    """Four small cameras above an arena of 60 cm with bare walls, and the calibration of their program in millimetres."""
+    """Four small cameras above an arena of 60 cm with bare walls, and their calibration in millimetres."""
     folder, rng = tmp_path_factory.mktemp("mouse"), np.random.default_rng(0)
     (folder / "videos").mkdir()
     bare = plaster(rng)

@@ -126,7 +126,9 @@ def turns_in_words(turns: Mapping[str, Turn], cameras: Collection[str]) -> list[
         if turn.wrong
     ]
     known = {name: max(turn[:2]) for name, turn in turns.items() if not turn.wrong}
-    listed = {name: f"{name} within {within:.2f} degrees ({turns[name].pixels:.1f} pixels)" for name, within in known.items()}
+    listed = {
+        name: f"{name} within {within:.2f} degrees ({turns[name].pixels:.1f} pixels)" for name, within in known.items()
+    }
     held = ", ".join(listed[name] for name, within in known.items() if within <= VAGUE)
     vague = ", ".join(listed[name] for name, within in known.items() if within > VAGUE)
     alone = ", ".join(name for name in cameras if name not in turns)

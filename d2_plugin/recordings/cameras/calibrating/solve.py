@@ -134,8 +134,9 @@ def _known_of(name: str, matches: Matches, features: Mapping[str, Features], kno
     if pair is None:
         return f"{name} shares nothing with the others"
     said = f"{name} shares {len(matches[pair])} features with {pair[pair[0] == name]}"
-    halves = (essential_pose(pair, half[pair], features, known) for half in (halved(matches, features, known, which) for which in (0, 1)))
-    poses = [replace(known[name], T_camera_world=pose) for pose in halves if pose is not None]
+    halves = [halved(matches, features, known, which)[pair] for which in (0, 1)]
+    found = [essential_pose(pair, half, features, known) for half in halves]
+    poses = [replace(known[name], T_camera_world=pose) for pose in found if pose is not None]
     if len(poses) < 2:
         return f"{said}, too few for two halves"
     return f"{said}, two halves of which disagree by {degrees_between(*poses):.1f} degrees"
