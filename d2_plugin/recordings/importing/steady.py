@@ -65,7 +65,9 @@ def _jump(images: np.ndarray, before: Sift, after: Sift) -> float:
     matches = cv2.BFMatcher(crossCheck=True).match(before[1], after[1])
     p = before[0][[match.queryIdx for match in matches]] - 0.5  # OpenCV puts centres at whole numbers
     q = after[0][[match.trainIdx for match in matches]] - 0.5
-    back, inside = cv2.estimateAffinePartial2D(q, p, ransacReprojThreshold=1.0) if len(p) >= FEWEST else (None, None)
+    if len(p) < FEWEST:
+        return np.nan
+    back, inside = cv2.estimateAffinePartial2D(q, p, ransacReprojThreshold=1.0)
     if back is None or inside.sum() < FEWEST:
         return np.nan
     p, q = p[inside.ravel() > 0], q[inside.ravel() > 0]

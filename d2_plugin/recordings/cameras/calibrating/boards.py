@@ -171,10 +171,10 @@ def scaled_by_board(rig: SolvedRig, images: Mapping[str, Sequence[np.ndarray]], 
         D2Error: no moment at which two cameras saw enough of the board, or sides that contradict each other.
     """
     seen = seen_corners({name: images[name] for name in rig.cameras}, board)
-    sides = []
+    sides: list[float] = []
     for corners in zip(*seen.values()):
         there = {name: board.ways(own) for name, own in zip(seen, corners) if own}
-        trials = (_sides(rig, board, dict(zip(there, ways))) for ways in product(*there.values()))
+        trials = [_sides(rig, board, dict(zip(there, ways))) for ways in product(*there.values())]
         sides += max(trials, key=len)
     if len(sides) < FEWEST_SIDES:
         raise D2Error(
