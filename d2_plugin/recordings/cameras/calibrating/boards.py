@@ -175,7 +175,8 @@ def scaled_by_board(rig: SolvedRig, images: Mapping[str, Sequence[np.ndarray]], 
     for corners in zip(*seen.values()):
         there = {name: board.ways(own) for name, own in zip(seen, corners) if own}
         trials = [_sides(rig, board, dict(zip(there, ways))) for ways in product(*there.values())]
-        sides += max(trials, key=len)
+        longest = max(trials, key=len)
+        sides += longest
     if len(sides) < FEWEST_SIDES:
         raise D2Error(
             f"two cameras saw {len(sides)} sides of the board's squares at the same moment, expected {FEWEST_SIDES} at "
