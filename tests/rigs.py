@@ -70,17 +70,24 @@ def worst(cameras: dict[str, Camera], truth: dict[str, Camera]) -> tuple[float, 
     return max(degrees), max(shares)
 
 
-def filmed(rig: dict[str, Camera], square: float) -> tuple[dict[str, list[np.ndarray]], Board]:
-    """Images of a ChArUco board of 7 x 5 squares that stands in front of the rig, and the board."""
-    board = Board(7, 5, square, 0.75 * square)
+def filmed(
+    rig: dict[str, Camera], square: float, plain: tuple[int, int] | None = None
+) -> tuple[dict[str, list[np.ndarray]], Board]:
+    """Images of a ChArUco board of 7 x 5 squares, or a plain one, that stands in front of the rig, and the board."""
     side = 60
-    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
-    drawn = cv2.aruco.CharucoBoard((7, 5), square, 0.75 * square, dictionary).generateImage((7 * side, 5 * side))
+    if plain is None:
+        board = Board(7, 5, square, 0.75 * square)
+        dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+        drawn = cv2.aruco.CharucoBoard((7, 5), square, 0.75 * square, dictionary).generateImage((7 * side, 5 * side))
+    else:
+        board = Board(*plain, square)
+        y, x = np.mgrid[: plain[1] * side, : plain[0] * side] // side
+        drawn = np.where((x + y) % 2, 255, 0).astype(np.uint8)
     images = {}
     for name, camera in rig.items():
         T = camera.T_camera_world
         onto_plane = camera.K @ np.column_stack([T[:3, 0] * square / side, T[:3, 1] * square / side, T[:3, 3]])
-        middle = np.array([[1, 0, -3.5 * side], [0, 1, -2.5 * side], [0, 0, 1.0]])
+        middle = np.array([[1, 0, -board.columns * side / 2], [0, 1, -board.rows * side / 2], [0, 0, 1.0]])
         half = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1.0]])  # cv2 puts centres at whole numbers
         warp = half @ onto_plane @ middle @ np.linalg.inv(half)
         grey = cv2.warpPerspective(drawn, warp, (camera.width, camera.height), flags=cv2.INTER_AREA, borderValue=128)

@@ -15,7 +15,7 @@ from d2_plugin.errors import D2Error
 from d2_plugin.recordings import open_recording, select_cameras
 from d2_plugin.recordings.cameras.calibrating.bundle import project
 from d2_plugin.recordings.cameras.calibrating.features import find_features
-from d2_plugin.recordings.cameras.calibrating.refine import refine_poses, turns_in_words
+from d2_plugin.recordings.cameras.calibrating.refine import Turn, refine_poses, turns_in_words
 from d2_plugin.recordings.cameras.calibrating.rig import aligned
 from d2_plugin.recordings.cameras.calibrating.solve import solve_features, solve_rig
 from d2_plugin.recordings.cameras.camera import rig_width, rigid
@@ -53,6 +53,14 @@ class TestRefinedPoses:
         assert refined.turns["c2"].degrees == pytest.approx(degrees, abs=0.1)
         assert "camera c2 is turned by" in turns_in_words(refined.turns, truth)[0]
         assert max(degrees_between(refined.cameras[name], truth[name]) for name in truth) < 0.1
+
+    def test_poses_that_features_settle_within_degrees_are_not_called_right(self) -> None:
+        said = turns_in_words({"a": Turn(0.1, 0.05, 0.2, False), "b": Turn(1.0, 7.9, 1.5, False)}, "abc")
+        assert said == [
+            "poses hold as far as features tell: a within 0.10 degrees (0.2 pixels)",
+            "poses that features hardly tell anything of: b within 7.90 degrees (1.5 pixels)",
+            "poses not checked: c, too few shared features",
+        ]
 
     def test_right_poses_stay(self) -> None:
         truth = arc()

@@ -59,7 +59,9 @@ class TestFocalLengths:
             solve_features(seen_by(truth, things=60), blind(truth), tuple(truth), focal="each")
 
 
-def held(rig: dict[str, Camera], square: float, moments: int) -> tuple[dict[str, list[np.ndarray]], Board]:
+def held(
+    rig: dict[str, Camera], square: float, moments: int, plain: tuple[int, int] | None = None
+) -> tuple[dict[str, list[np.ndarray]], Board]:
     """Images of a board at some places, in front of grey."""
     rng = np.random.default_rng(0)
     found: dict[str, list[np.ndarray]] = {name: [] for name in rig}
@@ -68,7 +70,7 @@ def held(rig: dict[str, Camera], square: float, moments: int) -> tuple[dict[str,
         turn[:3, :3] = cv2.Rodrigues(rng.uniform(-0.5, 0.5, 3))[0]
         turn[:3, 3] = rng.uniform(-0.35, 0.35, 3)
         moved = {name: replace(camera, T_camera_world=camera.T_camera_world @ turn) for name, camera in rig.items()}
-        images, board = filmed(moved, square)
+        images, board = filmed(moved, square, plain)
         for name, taken in images.items():
             found[name] += taken
     return found, board
@@ -87,6 +89,31 @@ class TestBoards:
         scaled = scaled_by_board(rig, images, board)
         assert rig_width(scaled.cameras.values()) == pytest.approx(rig_width(truth.values()), rel=0.005)
 
+    def test_an_inverted_board_and_one_of_older_programs_are_seen(self) -> None:
+        images, board = filmed(arc(2), 0.25)
+        assert len(board.corners(255 - images["c0"][0])) == len(board.corners(images["c0"][0])) == 24
+        dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+        older = cv2.aruco.CharucoBoard((7, 6), 0.25, 0.1875, dictionary)
+        older.setLegacyPattern(True)
+        drawn = cv2.copyMakeBorder(older.generateImage((420, 360)), *[60] * 4, cv2.BORDER_CONSTANT, value=128)
+        assert len(replace(board, rows=6).corners(np.repeat(drawn[..., None], 3, 2))) == 30
+
+    @pytest.mark.parametrize("size", [(8, 6), (8, 5)])
+    def test_a_plain_board_that_some_see_the_other_way_up_settles_the_rig_and_its_scale(self, size) -> None:
+        truth = arc(3, 40.0)
+        images, board = held(truth, 0.2, 6, plain=size)
+        images["c1"] = [np.ascontiguousarray(image[::-1, ::-1]) for image in images["c1"]]  # hung upside down
+        K = truth["c1"].K * [[1, 1, -1], [1, 1, -1], [1, 1, 1]] + [[0, 0, 640], [0, 0, 480], [0, 0, 0]]
+        over = np.diag([-1.0, -1, 1, 1])
+        truth["c1"] = replace(truth["c1"], K=K, T_camera_world=over @ truth["c1"].T_camera_world)
+        rig = solve_rig(images, truth, board=board)
+        degrees, share = worst(rig.cameras, truth)
+        assert degrees < 0.1
+        assert share < 0.003
+        scaled = scaled_by_board(rig, images, board)
+        assert rig_width(scaled.cameras.values()) == pytest.approx(rig_width(truth.values()), rel=0.005)
+        assert "the board was seen by c0 in 6 of 6 images, c1 in" in scaled.scale
+
     def test_half_of_a_charuco_board_is_enough_for_the_scale_and_half_of_a_plain_one_is_not(self) -> None:
         truth = arc(3)
         images, board = filmed(truth, 0.25)
@@ -98,7 +125,7 @@ class TestBoards:
         assert rig_width(scaled.cameras.values()) == pytest.approx(rig_width(truth.values()), rel=0.01)
         assert "sides of a board's squares" in scaled.scale
         blank = [np.full((480, 640, 3), 128, np.uint8)]
-        with pytest.raises(D2Error, match="saw 0 sides of the board's squares .* show the whole board"):
+        with pytest.raises(D2Error, match=r"saw 0 sides .*c1 in 0 of 1 images.*: show the whole board"):
             scaled_by_board(rig, {"c0": half["c0"], "c1": blank, "c2": blank}, board)
         with pytest.raises(D2Error, match="unknown marker dictionary 'DICT_9'"):
             scaled_by_board(rig, half, replace(board, dictionary="DICT_9"))

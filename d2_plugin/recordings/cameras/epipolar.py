@@ -17,6 +17,9 @@ OPENCVS_CONTRAST = 0.04  # of a SIFT feature, at least
 SCALES = (16.0, 8.0, 4.0, 2.0, 1.0, 1.0, 0.5, 0.5)  # pixels beyond which a match hardly counts, round by round
 LARGEST_TURN = 0.05  # radians of one step
 
+Sift = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Features: pixels [n, 2] with centres at i + 0.5, descriptors [n, 128], (size in pixels, angle in radians) [n, 2]."""
+
 
 def sift_features(
     image: np.ndarray,
@@ -25,8 +28,8 @@ def sift_features(
     contrast: float = OPENCVS_CONTRAST,
     mask: np.ndarray | None = None,
     tilted: bool = False,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(pixels [n, 2] with centres at i + 0.5, descriptors [n, 128], (size in pixels, angle in radians) [n, 2]).
+) -> Sift:
+    """The features of an image.
 
     Args:
         image: RGB uint8 [H, W, 3].

@@ -80,7 +80,7 @@ def common_clock(
         if watching is None:
             return {}
         by_motion, doubt = _of_motion(watching(), names, videos)
-        if doubt and (evidence or how == "motion" or not _of_one_recorder(videos.values())):
+        if doubt and (evidence or how == "motion" or not of_one_recorder(videos.values())):
             raise D2Error(f"{doubt}: {INSTEAD}")
         if doubt:
             method = f"{STAMPS}, as if one program had recorded them all ({doubt})"
@@ -160,7 +160,7 @@ def _of_motion(
     return [Evidence(names[0], name, seen[name].seconds - first, seen[name].error, "motion") for name in names[1:]], ""
 
 
-def _of_one_recorder(videos: Collection[VideoFile]) -> bool:
+def of_one_recorder(videos: Collection[VideoFile]) -> bool:
     """Whether videos are as long and as fast as those that one program writes of several cameras."""
     lengths, rates = [len(video.stamps) for video in videos], [video.rate for video in videos]
     return max(lengths) - min(lengths) <= 1 and max(rates) <= 1.001 * min(rates)

@@ -1,7 +1,6 @@
 """Each camera's gain, from pixels of two cameras that show the same point of a surface.
 
-Features of two images of one instant are matched, and kept where they lie on the epipolar line of the calibration
-and their triangulated point falls back on both.
+Features of two images of one instant are matched, and kept where they lie on the epipolar lines of the calibration.
 """
 
 from __future__ import annotations
@@ -11,7 +10,7 @@ from itertools import combinations
 
 import numpy as np
 
-from d2_plugin.recordings.cameras.epipolar import epipolar_lines, homogeneous, sift_features
+from d2_plugin.recordings.cameras.epipolar import epipolar_lines, homogeneous, sampson, sift_features
 from d2_plugin.recordings.images import opencv
 from d2_plugin.recordings.importing.clocks import linked_names
 from d2_plugin.recordings.recording import Camera, Exposure, Recording
@@ -20,7 +19,7 @@ from d2_plugin.recordings.selection import spread
 FRAMES = 6  # instants at which features are looked for, at most
 KNOWN = 0.004  # standard error of all gains at which no more instants are looked at
 FEATURES = 3000  # of an image, at most
-DIAGONAL = 1 / 800  # of the image: how far a feature may lie from where its triangulated point falls
+DIAGONAL = 1 / 800  # of the image: how far two features may lie from places that a calibration allows
 DISTINCT = 0.8  # A match is kept where the second best is this much farther away (Lowe 2004)
 
 LIKELY = 380.0
@@ -69,22 +68,8 @@ def _matched(one: Camera, other: Camera, features: _Features, others: _Features)
     first, second = np.sqrt(np.maximum(two, 0)).T
     kept = np.isfinite(first) & (first < DISTINCT * np.minimum(second, LIKELY)) & (back[best] == np.arange(len(p)))
     p, q = p[kept], q[best[kept]]
-    near = _consistent(one, other, p, q) if len(p) else np.zeros(0, bool)
+    near = np.abs(sampson(one, other, p, q)) < reach
     return p[near], q[near]
-
-
-def _consistent(one: Camera, other: Camera, p: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Whether the triangulated point of each pair lies before both cameras and falls on both places, bool [n]."""
-    cv2 = opencv("measuring exposure")
-    projections = [camera.K @ camera.T_camera_world[:3] for camera in (one, other)]
-    points = cv2.triangulatePoints(*projections, p.T, q.T)
-    kept = np.ones(len(p), bool)
-    for camera, projection, seen in zip((one, other), projections, (p, q)):
-        with np.errstate(invalid="ignore", divide="ignore"):
-            screen = (projection @ (points / points[3])).T
-            off = np.linalg.norm(screen[:, :2] / screen[:, 2:] - seen, axis=1)
-        kept &= (screen[:, 2] > 0) & (off < max(DIAGONAL * np.hypot(camera.width, camera.height), 0.7))
-    return kept
 
 
 def _around(image: np.ndarray, places: np.ndarray) -> np.ndarray:

@@ -26,7 +26,7 @@ from d2_plugin.errors import D2Error, MissingExtra
 from d2_plugin.locks import only_writer
 from d2_plugin.progress import progress_bar
 from d2_plugin.reading import json_text
-from d2_plugin.recordings.cameras.calibrating.refine import check_poses, refine, turns_in_words
+from d2_plugin.recordings.cameras.calibrating.refine import Turn, check_poses, refine, turns_in_words
 from d2_plugin.recordings.cameras.calibration import LARGE_RIG, Calibration, open_calibration
 from d2_plugin.recordings.cameras.camera import CalibratedCamera, rig_width, scaled
 from d2_plugin.recordings.cameras.check import calibration_contradicted
@@ -69,9 +69,9 @@ def import_videos(settings: ImportSettings, report: Report = lambda line: None) 
     refuse_another(folder, own)
     videos = {name: read_video(path) for name, path in paths.items()}
     check_calibration(settings)
-    solved = None
+    solved, doubt = None, ""
     if settings.calibration is not None:
-        videos, cameras, notes = _known_rig(settings, settings.calibration, videos)
+        videos, cameras, notes, doubt = _known_rig(settings, settings.calibration, videos)
     else:
         solved = _solved(settings, folder, videos, report)
         cameras = {entry["name"]: read_camera(entry, "the solved calibration") for entry in solved["cameras"]}
@@ -96,7 +96,7 @@ def import_videos(settings: ImportSettings, report: Report = lambda line: None) 
         few = source.checked(recording)
         recording = replace(recording, notes=(*notes, *_notes_of_videos(settings, videos, few)))
         if settings.refine_poses:
-            recording = _with_refined_poses(folder, recording, report)
+            recording = _with_refined_poses(folder, recording, report, doubt)
         elif solved is None and len(cameras) > 1:
             recording = _with_checked_poses(recording, few, report)
         if settings.images != "videos":
@@ -116,8 +116,8 @@ def import_videos(settings: ImportSettings, report: Report = lambda line: None) 
 
 def _known_rig(
     settings: ImportSettings, calibration: Path, videos: Mapping[str, VideoFile]
-) -> tuple[dict[str, VideoFile], dict[str, CalibratedCamera], tuple[str, ...]]:
-    """(videos turned as the calibration has them, their cameras, notes).
+) -> tuple[dict[str, VideoFile], dict[str, CalibratedCamera], tuple[str, ...], str]:
+    """(videos turned as the calibration has them, their cameras, notes, what refined poses must mend).
 
     Raises:
         D2Error: a calibration of another rig or in another unit than it seems.
@@ -139,11 +139,15 @@ def _known_rig(
                 f"{calibration} gives cameras {one.name} and {other.name} the identical pose: correct one, or leave "
                 "its video out"
             )
-    wrong, said = _contradiction(turned, cameras) if len(cameras) > 1 else (False, "")
+    wrong, mends, said = _contradiction(turned, cameras) if len(cameras) > 1 else (False, False, "")
+    doubt = ""
     if wrong and not settings.accept_calibration:
-        raise D2Error(f"{calibration} does not fit the videos: {said}; or give --accept-calibration")
-    more = (*more, said) if said else more
-    return turned, {camera.name: camera for camera in cameras}, (*notes, *more)
+        doubt = f"{calibration} does not fit the videos: {said}; or give --accept-calibration"
+        if not (mends and settings.refine_poses):
+            raise D2Error(doubt)
+    elif said:
+        more = (*more, said)
+    return turned, {camera.name: camera for camera in cameras}, (*notes, *more), doubt
 
 
 def _oriented(path: Path, videos: Mapping[str, VideoFile]) -> tuple[dict[str, VideoFile], Calibration, tuple[str, ...]]:
@@ -160,12 +164,22 @@ def _oriented(path: Path, videos: Mapping[str, VideoFile]) -> tuple[dict[str, Vi
         raise
 
 
-def _contradiction(videos: Mapping[str, VideoFile], cameras: Sequence[CalibratedCamera]) -> tuple[bool, str]:
-    """What an image near the middle of each video says against the calibration, see `calibration_contradicted`."""
+def _contradiction(videos: Mapping[str, VideoFile], cameras: Sequence[CalibratedCamera]) -> tuple[bool, bool, str]:
+    """What an image near the middle of each video says against the calibration, see `calibration_contradicted`.
+
+    Between the two whether turning back fewer than half of the cameras mends it; it says which, then.
+    """
     indices = {name: {0: decoded_alone(video, len(video.stamps) // 2)} for name, video in videos.items()}
     cuts = {camera.name: Cut(0, 0, *camera.size) for camera in cameras}
     source = VideosSource(videos, indices, {camera.name: camera for camera in cameras}, cuts)
-    return calibration_contradicted(Recording("videos", source.pinholes(), (0,), 1.0, source))
+    recording = Recording("videos", source.pinholes(), (0,), 1.0, source)
+    wrong, said = calibration_contradicted(recording)
+    turns: dict[str, Turn] = {}
+    if wrong and "swapped" not in said:
+        with suppress(MissingExtra):
+            turns = {name: turn for name, turn in check_poses(recording).items() if turn.wrong}
+    mends = 0 < 2 * len(turns) < len(cameras)
+    return wrong, mends, "; ".join(turns_in_words(turns, turns)) if mends else said
 
 
 def _solved(settings: ImportSettings, folder: Path, videos: Mapping[str, VideoFile], report: Report) -> dict[str, Any]:
@@ -243,8 +257,12 @@ def _with_checked_poses(recording: Recording, few: Recording, report: Report) ->
     return replace(recording, notes=(*recording.notes, *sentences[: sum(turn.wrong for turn in turns.values())]))
 
 
-def _with_refined_poses(folder: Path, recording: Recording, report: Report) -> Recording:
-    """The recording with the poses that its images prove to be better, or with those that were given."""
+def _with_refined_poses(folder: Path, recording: Recording, report: Report, doubt: str) -> Recording:
+    """The recording with the poses that its images prove to be better, or with those that were given.
+
+    Raises:
+        D2Error: those that were given stay, and there is a `doubt` about them.
+    """
 
     def make() -> dict[str, Any]:
         refined = refine(recording)
@@ -253,6 +271,8 @@ def _with_refined_poses(folder: Path, recording: Recording, report: Report) -> R
 
     refined = kept(folder, "poses", make)
     report(f"poses: {refined['reason']}")
+    if doubt and not refined["accepted"]:
+        raise D2Error(doubt)
     source = recording.source
     if not isinstance(source, VideosSource) or not refined["poses"]:
         return recording

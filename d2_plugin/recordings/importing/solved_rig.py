@@ -24,7 +24,7 @@ from d2_plugin.recordings.cameras.formats.cameras_json import camera_table
 from d2_plugin.recordings.cameras.lens import Lens
 from d2_plugin.recordings.cameras.undistort import UndistortedSource, Undistortion
 from d2_plugin.recordings.images import IMAGE_SUFFIXES, opencv, read_image
-from d2_plugin.recordings.importing.clocks import METHODS, Clock, common_clock, given_clock
+from d2_plugin.recordings.importing.clocks import METHODS, Clock, common_clock, given_clock, of_one_recorder
 from d2_plugin.recordings.importing.grid import grid_of
 from d2_plugin.recordings.importing.settings import ImportChoices, by_camera, finite
 from d2_plugin.recordings.importing.video import VideoFile, VideoFrames
@@ -33,6 +33,7 @@ from d2_plugin.recordings.selection import spread
 MOMENTS = 8  # images of each camera that are read, spread over the recording
 BOARD_MOMENTS = 24  # the same where a board was filmed, which is held in many places
 TOGETHER = 0.1  # frames by which cameras may expose apart for what moves to be a witness
+BOARD_TOGETHER = 0.5  # the same for a board, which is held still
 SHARED, EACH = "shared", "each"  # focal lengths that are not known: one for all cameras, or one for each of them
 
 
@@ -58,7 +59,7 @@ def rig_of_videos(
     distance = None if choices.distance is None else _distance(choices.distance, list(videos))
     lenses = _lenses(choices.intrinsics, choices.focal, {name: video.size for name, video in videos.items()})
     stills = {} if choices.stills is None else _stills(choices.stills, lenses)
-    images = _images(videos, lenses, choices.offsets, MOMENTS if board is None else BOARD_MOMENTS)
+    images = _images(videos, lenses, choices.offsets, board is not None)
     known = {name: camera.pinhole() for name, camera in lenses.cameras.items()}
     known |= {name: replace(known[taker], name=name) for name, (taker, _) in stills.items()}
     rig = solve_rig(images, known, {name: image for name, (_, image) in stills.items()}, board, lenses.focal)
@@ -177,12 +178,24 @@ def _as_taken(path: Path, camera: CalibratedCamera) -> np.ndarray:
 
 
 def _images(
-    videos: Mapping[str, VideoFile], lenses: Lenses, offsets: tuple[str, ...], moments: int
+    videos: Mapping[str, VideoFile], lenses: Lenses, offsets: tuple[str, ...], board: bool
 ) -> dict[str, list[np.ndarray]]:
-    """Undistorted images by camera: of moments that all share, or one of what stands still where none are known."""
+    """Undistorted images by camera: of moments that all share, or one of what stands still where none are known.
+
+    Raises:
+        D2Error: a `board`, and nothing says which images show it at the same moment.
+    """
+    moments = BOARD_MOMENTS if board else MOMENTS
     known = len(offsets) == 1 and offsets[0] in METHODS
     clocks = common_clock(videos, offsets[0], None) if known else given_clock(videos, offsets)
-    indices = _together(videos, clocks, moments) if clocks else None
+    if board and not clocks and of_one_recorder(videos.values()):
+        clocks = given_clock(videos, ())
+    indices = _together(videos, clocks, moments, BOARD_TOGETHER if board else TOGETHER) if clocks else None
+    if board and indices is None:
+        raise D2Error(
+            "--board is matched at moments that all cameras share, and neither timecode nor sound says which these "
+            "are: give --offsets NAME=FRAMES,..., or none where the cameras started together"
+        )
     chosen = indices or {name: spread(range(len(video.stamps)), moments) for name, video in videos.items()}
     frames = VideoFrames(videos, {name: dict(enumerate(places)) for name, places in chosen.items()})
     source = UndistortedSource(frames, {name: one for name, one in lenses.cameras.items() if one.lens.bends})
@@ -200,15 +213,15 @@ def _images(
 
 
 def _together(
-    videos: Mapping[str, VideoFile], clocks: Mapping[str, Clock], moments: int
+    videos: Mapping[str, VideoFile], clocks: Mapping[str, Clock], moments: int, reach: float
 ) -> dict[str, list[int]] | None:
-    """Frames by camera of moments at which all exposed together; None where there are fewer than three."""
+    """Frames by camera of moments at which all exposed within `reach` of a frame; None where fewer than three are."""
     grid = grid_of(videos, clocks)
     frames = list(next(iter(grid.indices.values())))
     apart = {
         frame: np.ptp([grid.late[name][frame] for name in videos]) * grid.rate if grid.late else 0.0 for frame in frames
     }
-    together = [frame for frame in frames if apart[frame] <= TOGETHER]
+    together = [frame for frame in frames if apart[frame] <= reach]
     if len(together) < min(3, len(frames)):
         return None
     chosen = spread(together, moments)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -9,12 +11,14 @@ import pytest
 from recorded import write_video
 
 from d2_plugin.errors import D2Error
+from d2_plugin.recordings import open_recording, select_cameras, select_frames
 from d2_plugin.recordings.cameras.camera import CalibratedCamera, pinhole
 from d2_plugin.recordings.cameras.lens import Lens
 from d2_plugin.recordings.importing.source import Cut, VideosSource
 from d2_plugin.recordings.importing.steady import steadiness
 from d2_plugin.recordings.importing.video import Decoder, VideoFile, read_video
-from d2_plugin.recordings.recording import Recording
+from d2_plugin.recordings.recording import Recording, Source
+from d2_plugin.recordings.selection import spread
 
 pytest.importorskip("av")
 
@@ -155,6 +159,35 @@ def test_a_camera_that_was_moved_or_drifts_is_noticed(
     assert 160 * steady.moved == pytest.approx(moved, abs=1)
     assert steady.drift == pytest.approx(drift, abs=0.02)
     assert not moved or steady.between[0] <= 0.5 <= steady.between[1]
+
+
+@dataclass(frozen=True)
+class Bumped(Source):
+    """A recording whose cameras are turned from a frame on."""
+
+    recording: Recording
+    first: int
+    degrees: float
+
+    def image(self, camera: str, frame: int) -> np.ndarray:
+        cv2, image = pytest.importorskip("cv2"), self.recording.image(camera, frame)
+        K, axis = self.recording.cameras[camera].K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]], np.array([0.3, -0.2, 0.93])
+        turn = K @ cv2.Rodrigues(np.deg2rad(self.degrees) * axis)[0] @ np.linalg.inv(K)
+        return cv2.warpPerspective(image, turn, image.shape[1::-1]) if frame >= self.first else image
+
+
+@pytest.mark.parametrize(("name", "camera"), [("studio", "02"), ("plaza", "05"), ("dome", "03")])
+def test_a_camera_that_is_bumped_by_half_a_degree_is_noticed_though_people_walk(
+    shared_data: Callable[[str], Path], name: str, camera: str
+) -> None:
+    """Mostly about its own axis, where nothing in the middle of the image moves."""
+    whole = select_cameras(open_recording(shared_data(name)), (camera,))
+    recording = select_frames(whole, spread(whole.frames, 9))
+    first = recording.frames[5]
+    assert steadiness(recording)[camera].moved == 0
+    steady = steadiness(replace(recording, source=Bumped(whole, first, 0.5)))[camera]
+    assert steady.moved > 0
+    assert steady.between[0] < first / recording.fps <= steady.between[1]
 
 
 @pytest.mark.parametrize(

@@ -35,6 +35,8 @@ from d2_plugin.values import checked_arguments
 MOMENTS = 6  # frames that are read, spread over the recording
 TURNED = 0.15  # degrees by which a camera that is called wrong is turned: a quarter of a degree ruins stereo
 
+VAGUE = 1.0  # degrees: a pose that is known no better is not held to be right
+
 CHECKED = 3  # moments of images that poses are only held against
 
 REACH = 0.04  # matches farther from where the given poses expect them are not believed, in diagonals of the image
@@ -123,14 +125,16 @@ def turns_in_words(turns: Mapping[str, Turn], cameras: Collection[str]) -> list[
         for name, turn in turns.items()
         if turn.wrong
     ]
-    held = ", ".join(
-        f"{name} within {max(turn.degrees, turn.doubt):.2f} degrees ({turn.pixels:.1f} pixels)"
-        for name, turn in turns.items()
-        if not turn.wrong
-    )
-    unknown = ", ".join(name for name in cameras if name not in turns)
-    more = [f"poses hold as far as features tell: {held}"] if held else []
-    return sentences + more + ([f"poses not checked: {unknown}, too few shared features"] if unknown else [])
+    known = {name: max(turn[:2]) for name, turn in turns.items() if not turn.wrong}
+    listed = {
+        name: f"{name} within {within:.2f} degrees ({turns[name].pixels:.1f} pixels)" for name, within in known.items()
+    }
+    held = ", ".join(listed[name] for name, within in known.items() if within <= VAGUE)
+    vague = ", ".join(listed[name] for name, within in known.items() if within > VAGUE)
+    alone = ", ".join(name for name in cameras if name not in turns)
+    sentences += [f"poses hold as far as features tell: {held}"] if held else []
+    sentences += [f"poses that features hardly tell anything of: {vague}"] if vague else []
+    return sentences + ([f"poses not checked: {alone}, too few shared features"] if alone else [])
 
 
 def _expected(

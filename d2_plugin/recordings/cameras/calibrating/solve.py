@@ -16,7 +16,7 @@ from operator import le
 import numpy as np
 
 from d2_plugin.errors import D2Error
-from d2_plugin.recordings.cameras.calibrating.boards import Board, board_matches
+from d2_plugin.recordings.cameras.calibrating.boards import Board, board_matches, how_often, seen_corners
 from d2_plugin.recordings.cameras.calibrating.bundle import Bundle, Tracks, fitting, join_matches, project, triangulate
 from d2_plugin.recordings.cameras.calibrating.features import (
     Features,
@@ -31,10 +31,11 @@ from d2_plugin.recordings.cameras.calibrating.features import (
     silent_pycolmap,
     verified,
 )
-from d2_plugin.recordings.cameras.calibrating.refine import SCHEDULE, bundled, half_of
+from d2_plugin.recordings.cameras.calibrating.refine import SCHEDULE, bundled, half_of, halved
 from d2_plugin.recordings.cameras.calibrating.rig import SolvedRig, differences
 from d2_plugin.recordings.cameras.calibrating.sharpen import sharpened
 from d2_plugin.recordings.cameras.camera import pinhole, rigid
+from d2_plugin.recordings.cameras.epipolar import degrees_between
 from d2_plugin.recordings.images import checked_image
 from d2_plugin.recordings.recording import Camera
 from d2_plugin.values import checked_arguments
@@ -86,8 +87,14 @@ def solve_rig(
         raise D2Error(f"no intrinsics for camera {unknown[0] if unknown else 'any'}: give size and K of every camera")
     features = {name: of_a_still_camera(_of_one_size(name, taken), tilted=True) for name, taken in images.items()}
     features |= {name: find_features([image], tilted=True) for name, image in (stills or {}).items()}
-    features, corners = (features, {}) if board is None else board_matches(features, images, board)
-    return solve_features(features, intrinsics, tuple(images), corners, focal)
+    if board is None:
+        return solve_features(features, intrinsics, tuple(images), focal=focal)
+    seen = seen_corners(images, board)
+    features, corners = board_matches(features, seen, board)
+    try:
+        return solve_features(features, intrinsics, tuple(images), corners, focal)
+    except D2Error as refused:
+        raise D2Error(f"{refused}; {how_often(seen)}") from None
 
 
 def solve_features(
@@ -111,13 +118,28 @@ def solve_features(
     bundle = _grown(matches, tracks, features, known)
     unsettled = list(wanted) if bundle is None else [name for name in wanted if name not in bundle.cameras]
     if bundle is None or unsettled:
-        raise D2Error(f"the images do not settle where camera {', '.join(unsettled)} stands: {ADD}")
+        known_of = "; ".join(_known_of(name, matches, features, known) for name in unsettled[:3])
+        raise D2Error(f"the images do not settle where camera {', '.join(unsettled)} stands ({known_of}): {ADD}")
     features, tracks = sharpened(features, tracks.within(bundle.cameras), bundle.cameras)
     schedule = SCHEDULE if any(features[name].greys is None for name in tracks.names) else FINE
     bundle = bundled(bundle.cameras, features, tracks, schedule, focal) or bundle
     doubt, focals = _doubt(bundle, tracks, features, schedule, focal)
     _refuse_unsure(doubt, focals, wanted)
     return SolvedRig.of(bundle, features, doubt, focals, tuple(wanted))
+
+
+def _known_of(name: str, matches: Matches, features: Mapping[str, Features], known: Mapping[str, Camera]) -> str:
+    """What a camera that is not settled shares with another one, and what two halves of that disagree by."""
+    pair = max((pair for pair in matches if name in pair), key=lambda pair: len(matches[pair]), default=None)
+    if pair is None:
+        return f"{name} shares nothing with the others"
+    said = f"{name} shares {len(matches[pair])} features with {pair[pair[0] == name]}"
+    halves = [halved(matches, features, known, which)[pair] for which in (0, 1)]
+    found = [essential_pose(pair, half, features, known) for half in halves]
+    poses = [replace(known[name], T_camera_world=pose) for pose in found if pose is not None]
+    if len(poses) < 2:
+        return f"{said}, too few for two halves"
+    return f"{said}, two halves of which disagree by {degrees_between(*poses):.1f} degrees"
 
 
 def _of_one_size(name: str, taken: Sequence[np.ndarray]) -> Sequence[np.ndarray]:
@@ -263,9 +285,12 @@ def _refuse_unsure(
 ) -> None:
     unsure = [name for name in wanted if name not in doubt or not all(map(le, doubt[name], LARGEST_DOUBT))]
     if unsure:
+        by = (f"{name} by {doubt[name][0]:.2f} degrees and {doubt[name][1]:.1%}" for name in unsure if name in doubt)
+        degrees, share = LARGEST_DOUBT
         raise D2Error(
-            f"two halves of the images disagree about where camera {', '.join(unsure)} stands, so that is not known: "
-            f"{ADD}"
+            f"two halves of the images disagree about where camera {', '.join(unsure)} stands"
+            f"{f' ({listed} of the width)' if (listed := ', '.join(by)) else ''}, at most {degrees} degrees and "
+            f"{share:.1%} are taken: {ADD}"
         )
     vague = [name for name in wanted if focals.get(name, 0.0) > LARGEST_FOCAL_DOUBT]
     if vague:

@@ -1,0 +1,161 @@
+"""Stand-ins for three recordings of public laboratories: webcams with a board, Xvid at wide angles, a mouse."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from calibration_writers import Known, toml
+from recorded import Filmed
+from rigs import arc, cv2, filmed, worst
+
+from d2_plugin.commands.cli import main
+from d2_plugin.durable import read_table
+from d2_plugin.recordings import open_recording, select_cameras, select_frames
+from d2_plugin.recordings.cameras.calibration import read_calibration
+from d2_plugin.recordings.cameras.camera import pinhole, rig_width, rigid
+from d2_plugin.recordings.cameras.epipolar import rotated
+from d2_plugin.recordings.export.folder import described
+from d2_plugin.recordings.importing.steps import KIND
+from d2_plugin.recordings.recording import Camera
+from d2_plugin.recordings.synthetic.materials import plaster
+from d2_plugin.recordings.synthetic.raycast import Room, Scene, Solid, render_color
+
+av = pytest.importorskip("av")
+
+MOMENTS = 5  # images of each webcam
+
+
+def write_avi(path: Path, images: Sequence[np.ndarray], rate: int, tag: str = "XVID") -> None:
+    """MPEG-4 with B-frames, as Xvid writes it."""
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("mpeg4", rate=rate)
+        stream.height, stream.width = images[0].shape[:2]
+        stream.pix_fmt, stream.bit_rate, stream.gop_size = "yuv420p", 8_000_000, 12
+        stream.codec_context.max_b_frames, stream.codec_context.codec_tag = 2, tag
+        for image in images:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
+        container.mux(stream.encode())
+
+
+@pytest.fixture(scope="module")
+def webcams(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Camera]]:
+    """Four of one program, six frames a second, without sound, 40 degrees apart: a board is held up, no more."""
+    folder, truth = tmp_path_factory.mktemp("webcams"), arc(4, 40.0)
+    rng, taken = np.random.default_rng(3), {name: [] for name in truth}
+    for _ in range(MOMENTS):
+        turn = rigid(cv2.Rodrigues(rng.uniform(-0.4, 0.4, 3))[0], rng.uniform(-0.35, 0.35, 3))
+        moved = {name: replace(one, T_camera_world=one.T_camera_world @ turn) for name, one in truth.items()}
+        for name, images in filmed(moved, 0.2)[0].items():
+            taken[name] += images
+    for name, images in taken.items():
+        write_avi(folder / f"{name}.avi", images, 6)
+    return folder, truth
+
+
+def lenses(folder: Path, cameras: dict[str, Camera]) -> Path:
+    entries = [
+        {"name": name, "width": one.width, "height": one.height, "R": np.eye(3).tolist(), "t": [0, 0, 0]}
+        | {"fx": one.K[0, 0], "fy": one.K[1, 1], "cx": one.K[0, 2], "cy": one.K[1, 2]}
+        for name, one in cameras.items()
+    ]
+    (folder / "lenses.json").write_text(json.dumps({"cameras": entries}))
+    return folder / "lenses.json"
+
+
+def test_four_webcams_with_a_board_are_placed_in_metres(webcams: tuple, tmp_path: Path, capsys) -> None:
+    folder, truth = webcams
+    words = ["import", str(folder), "--intrinsics", str(lenses(tmp_path, truth)), "--board", "charuco:7x5:0.2:0.15"]
+    words += ["--offsets", "auto", "--exposure", "false", "--images", "videos", "--output", str(tmp_path / "c")]
+    assert main(words) == 0
+    said = capsys.readouterr().out
+    assert "the board was seen by c0 in" in said
+    found = {one.name: one.pinhole() for one in read_calibration(tmp_path / "c" / "calibration.json")}
+    degrees, share = worst(found, truth)
+    assert degrees < 0.2
+    assert share < 0.005
+    assert rig_width(found.values()) == pytest.approx(rig_width(truth.values()), rel=0.01)
+
+
+def test_webcams_whose_board_is_hidden_from_one_are_told_so(webcams: tuple, tmp_path: Path, capsys, refused) -> None:
+    folder, truth = webcams
+    for path in folder.glob("*.avi"):
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    write_avi(tmp_path / "c3.avi", [np.full((480, 640, 3), 128, np.uint8)] * MOMENTS, 6)
+    words = ["import", str(tmp_path), "--intrinsics", str(lenses(tmp_path, truth)), "--board", "charuco:7x5:0.2:0.15"]
+    assert main([*words, "--offsets", "none", "--output", str(tmp_path / "c")]) == 2
+    said = capsys.readouterr().err
+    assert "do not settle where camera c3 stands (c3 shares nothing with the others)" in said
+    assert "c3 in 0 of 5 images" in said
+    write_avi(tmp_path / "c3.avi", [np.full((480, 640, 3), 128, np.uint8)] * 12, 6)
+    assert "--board is matched at moments" in refused(*words, "--output", tmp_path / "c")
+
+
+def test_xvid_at_wide_angles_is_imported_and_a_turned_camera_named(
+    shared_data: Callable[[str], Path], tmp_path: Path, capsys
+) -> None:
+    """Real images, 31 to 46 degrees apart."""
+    whole = select_cameras(open_recording(shared_data("dome")), ("03", "07", "12", "15"))
+    recording = select_frames(whole, whole.frames[:8])
+    (tmp_path / "videos").mkdir()
+    for name in recording.cameras:
+        write_avi(tmp_path / "videos" / f"{name}.avi", [recording.image(name, frame) for frame in recording.frames], 30)
+    turned = rotated(recording.cameras["12"], np.deg2rad([1.2, -1.2, 1.0]))
+    right, wrong = tmp_path / "right.json", tmp_path / "wrong.json"
+    right.write_text(json.dumps(described(recording)))
+    wrong.write_text(json.dumps(described(replace(recording, cameras={**recording.cameras, "12": turned}))))
+    words = ["import", str(tmp_path / "videos"), "--offsets", "none", "--exposure", "false", "--images", "videos"]
+    assert main([*words, "--calibration", str(right), "--output", str(tmp_path / "a")]) == 0
+    said = capsys.readouterr().out
+    assert "poses hold as far as features tell: 03 within" in said
+    assert "note" not in said
+    words += ["--calibration", str(wrong), "--output", str(tmp_path / "b")]
+    main(words)  # a warning, or refused where plain features see it as well
+    named = re.search(r"camera 12 is turned by ([\d.]+) degrees \(known within", "".join(capsys.readouterr()))
+    assert named is not None
+    assert float(named[1]) == pytest.approx(np.linalg.norm([1.2, -1.2, 1.0]), abs=0.1)
+    assert main([*words[:-1], str(tmp_path / "c"), "--refine-poses"]) == 0
+    assert worst(open_recording(tmp_path / "c").cameras, recording.cameras)[0] < 0.1
+
+
+@pytest.fixture(scope="module")
+def mouse(tmp_path_factory: pytest.TempPathFactory) -> Filmed:
+    """Four small cameras above an arena of 60 cm with bare walls, and their calibration in millimetres."""
+    folder, rng = tmp_path_factory.mktemp("mouse"), np.random.default_rng(0)
+    (folder / "videos").mkdir()
+    bare = plaster(rng)
+    coat = np.clip(rng.normal(0.15, 0.08, (32, 32, 3)), 0, 1)
+
+    def runs(seconds: float) -> tuple[np.ndarray, np.ndarray]:
+        return np.eye(3), np.array([0.12 * np.cos(4 * seconds), 0.1 * np.sin(7 * seconds), 0.03])
+
+    room = Room(np.array([-0.3, -0.3, 0.0]), np.array([0.3, 0.3, 0.5]), ((bare, bare), (bare, bare), (bare, bare)))
+    scene = Scene(room, (Solid(runs, coat, np.full(3, 0.03), radius=0.03),), np.array([[0.0, 0.0, 0.48]] * 4))
+    known = []
+    for number, angle in enumerate(np.deg2rad([0.0, 80.0, 170.0, 260.0])):
+        centre = np.array([0.24 * np.cos(angle), 0.24 * np.sin(angle), 0.4])
+        forward = -centre / np.linalg.norm(centre)
+        right = np.cross(forward, [0.0, 0, 1]) / np.linalg.norm(np.cross(forward, [0.0, 0, 1]))
+        R = np.stack([right, np.cross(forward, right), forward])
+        K = pinhole(150.0, 150.0, 100.5, 80.5)
+        camera = Camera(f"cam_{number}", 200, 160, K, rigid(R, -R @ centre))
+        images = [render_color(scene, camera, i / 30) for i in range(16)]
+        write_avi(folder / "videos" / f"{camera.name}.avi", images, 30)
+        half = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+        known.append(Known(camera.name, (200, 160), K - half, (0.0,) * 5, R, -R @ centre * 1000))
+    return Filmed(folder, toml("calibration.toml")(folder, known))
+
+
+def test_a_mouse_among_four_small_cameras(mouse: Filmed, tmp_path: Path, refused) -> None:
+    words = ["import", str(mouse.videos), "--calibration", str(mouse.calibration), "--images", "videos"]
+    words += ["--output", str(tmp_path / "c")]
+    assert "up to 480 apart, which is no metres: say what it is with --unit mm" in refused(*words)
+    assert main([*words, "--unit", "mm"]) == 0
+    for name, clock in read_table(tmp_path / "c" / "import" / "clocks.json", KIND).items():
+        assert abs(clock["seconds"]) <= 2 * clock["error"] + 1e-9, name
+    assert rig_width(open_recording(tmp_path / "c").cameras.values()) == pytest.approx(0.48, abs=0.01)
