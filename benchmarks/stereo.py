@@ -14,7 +14,7 @@ import torch
 from benchmarks.rows import begin_rows
 from benchmarks.stereo_measure import Method, measure, methods
 from benchmarks.stereo_rigs import ARCS, MIDDLEBURY, load_rigs
-from d2_plugin.errors import unknown_name
+from d2_plugin.errors import refuse_unknown
 from d2_plugin.runs.rows import Row, append_rows, command_line, make_row
 from d2_plugin.runs.tables import Table, markdown
 from d2_plugin.settings import AtATime, Range, Settings
@@ -84,9 +84,7 @@ def _row(found: dict[str, Any], **more: Any) -> Row:
 def _chosen(makers: Sequence[str], defaults_only: bool) -> list[Method]:
     every = methods()
     known = dict.fromkeys(method.name for method in every)
-    for name in makers:
-        if name not in known:
-            raise unknown_name("stereo matcher", name, known)
+    refuse_unknown("stereo matcher", makers, known)
     return [
         method
         for method in every

@@ -17,7 +17,7 @@ from typing import Any, get_args
 
 import numpy as np
 
-from d2_plugin.errors import D2Error, missing_extra, unknown_name
+from d2_plugin.errors import D2Error, missing_extra, refuse_unknown, unknown_name
 from d2_plugin.priors.monocular.align import KINDS
 from d2_plugin.priors.settings import Preprocessing
 from d2_plugin.reading import parsing, said
@@ -105,8 +105,7 @@ class MonocularModel:
         self.path, self.kind = Path(path), kind
         if kind not in KINDS:
             raise unknown_name("monocular kind", str(kind), KINDS)
-        if preprocessing not in PREPROCESSINGS:
-            raise unknown_name("preprocessing", preprocessing, PREPROCESSINGS)
+        refuse_unknown("preprocessing", [preprocessing], PREPROCESSINGS)
         self.session = _session(self.path, threads)
         self.input = NetworkInput.of(self.session, self.path, views)
         self.preprocessing = _recognised(self.input) if preprocessing == "auto" else preprocessing

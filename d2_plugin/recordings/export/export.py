@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from d2_plugin.errors import D2Error, unknown_name
+from d2_plugin.errors import D2Error, refuse_unknown
 from d2_plugin.protocol import EXPORT_FILE
 from d2_plugin.reading import json_text
 from d2_plugin.recordings.cameras.formats.cameras_json import refuse_skew
@@ -62,8 +62,7 @@ def export_recording(
     Raises:
         D2Error: what the layout cannot hold (principal points, several focal lengths, skew), by camera.
     """
-    if layout not in WRITERS:
-        raise unknown_name("layout", layout, WRITERS)
+    refuse_unknown("layout", [layout], WRITERS)
     held_out = _known(recording, test_cameras)
     if cloud is not None:
         cloud.check()
@@ -92,9 +91,7 @@ def _calibration(camera: Camera) -> dict[str, Any]:
 
 
 def _known(recording: Recording, test_cameras: Sequence[str]) -> tuple[str, ...]:
-    for name in test_cameras:
-        if name not in recording.cameras:
-            raise unknown_name("camera", name, recording.cameras)
+    refuse_unknown("camera", test_cameras, recording.cameras)
     if set(test_cameras) >= set(recording.cameras):
         raise D2Error(f"all cameras of {recording.name} are held out: leave at least one to train on")
     return tuple(test_cameras)
