@@ -136,7 +136,7 @@ def _profile(settings: GpuBench) -> list[str]:
 
 def _stereo(device: str) -> Callable[[GpuBench], list[str]]:
     def words(settings: GpuBench) -> list[str]:
-        kind = ("--makers", "patchmatch", "--defaults-only", "--rigs", "synthetic4", "--width", "640")
+        kind = ("--defaults-only", "--rigs", "synthetic4", "--width", "640")
         return _part("stereo", *kind, "--device", device, "--output", str(settings.output / f"stereo-{device}.jsonl"))
 
     return words
