@@ -95,9 +95,7 @@ def load_library(
 
     Args:
         name: what the library is called in the cache and in messages, e.g. ``"rasterizer"``.
-        sources: C++ files, compiled together.
         headers: files the sources include; a change in them compiles anew, their folders are searched for includes.
-        flags: added to `BASE_FLAGS`.
 
     Raises:
         NoCompiler: there is no C++17 compiler.

@@ -92,14 +92,12 @@ def evaluate(
 
     Args:
         render: draws one view; colours are clamped to 0..1 here.
-        recording: the truth.
         cameras, frames: what to compare: every camera at every frame.
         output: folder for one image per view, `<camera>_<frame>.png`: truth, render, rendered depth and error side
             by side (and true depth where there is one). No images where None.
         between: frames that were not trained, between others that were. The means leave them out; `psnr` and
             `psnr_moving` over them stand beside the means as `psnr_between` and `psnr_moving_between`.
         lpips, lpips_vgg: from `find_lpips`, on AlexNet and on VGG16; a score is null where its network is None.
-        progress: called after every view.
 
     Returns:
         {"test": mean of each metric over the views that have it (null where none has),

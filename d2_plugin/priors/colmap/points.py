@@ -88,7 +88,6 @@ def triangulate(
 
     Args:
         images: RGB uint8 [H, W, 3], one per camera.
-        cameras: their calibrations.
         frame: what to note as the points' frame.
 
     Returns:

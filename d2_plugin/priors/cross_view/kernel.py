@@ -135,8 +135,6 @@ def compare_views(
     """(labels, depth, sigma) of each view after its mono-only pixels were compared with all others (`with_evidence`).
 
     Args:
-        views: by camera.
-        cameras: their calibrations.
         agreeing: by camera, the factor of sigma where another map agrees.
         numbers: `tolerance` in log depth, the factor of sigma `alone`, and `at_best`.
     """

@@ -97,7 +97,6 @@ def align(mono: np.ndarray, geometric: np.ndarray, *, kind: MonoKind, settings: 
     Args:
         mono: D^m float [H, W]: inverse depth up to scale and shift (`relative`), or depth (`metric`).
         geometric: D^g float [H, W], planar depth, 0 or NaN where unknown.
-        kind: what `mono` is.
         settings: residual, smoothing and when a fit is refused.
 
     Raises:

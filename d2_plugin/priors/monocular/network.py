@@ -83,7 +83,6 @@ class MonocularModel:
     """A monocular depth network; call it with an image.
 
     Args:
-        path: the ONNX file.
         kind: `relative` (inverse depth) or `metric` (depth).
         preprocessing: `depth_anything_v2` (cubic resize, ImageNet mean and deviation), `unit` (0..1), or `auto`.
         threads: of one inference; one per worker process is fastest for frames that are independent.

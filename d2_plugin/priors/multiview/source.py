@@ -51,11 +51,7 @@ class MultiviewSource:
     """Multi-view depth of a recording.
 
     Args:
-        recording: whose cameras and images.
-        names: the training cameras.
-        settings: `multiview` and its kin.
         cache: folder for the predictions of an ONNX network.
-        read: reads the images of one frame.
 
     Raises:
         D2Error: no such files or network, or a network for another number of views.

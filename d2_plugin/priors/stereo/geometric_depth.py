@@ -41,7 +41,6 @@ def geometric_depth(
         images: RGB uint8 [H, W, 3] per camera.
         cameras: at least two, in the same order.
         depth_range: near and far in world units; ten times too wide does no harm.
-        settings: matching and filtering.
         memories: by scale, matches of the frames before, which are carried over where the images did not change, and
             which this frame's are added to.
 
@@ -56,8 +55,9 @@ def geometric_depth(
     grays = [gray(image) for image in images]
     by_scale = []
     for scale, memory in zip(SCALES, memories or repeat(None)):
-        small = [_shrunk(*view, settings.max_pixels, scale) for view in zip(grays, cameras)]
-        filtered = _matched(*zip(*small), depth_range, settings, memory, scale)
+        shrunk = [_shrunk(*view, settings.max_pixels, scale) for view in zip(grays, cameras)]
+        small, small_cameras = zip(*shrunk)
+        filtered = _matched(small, small_cameras, depth_range, settings, memory, scale)
         tolerance = RELATIVE_DEPTH * scale
         by_scale.append(
             [enlarged(one, camera.width, camera.height, tolerance) for one, camera in zip(filtered, cameras)]

@@ -25,12 +25,9 @@ class MatchedDepth(GeometricSource):
     """Filtered geometric depth that is matched between the cameras.
 
     Args:
-        cameras: the cameras that are matched.
-        bounds: depth range that is searched.
         settings: matching, filtering, carrying over.
         cache: folder below which depth is kept.
         frames: all frame numbers of the build, ascending.
-        read: reads the images of one frame.
     """
 
     def __init__(

@@ -54,7 +54,6 @@ def export_recording(
 
     Args:
         recording: cameras and frames to write; restrict it with `select_cameras`, `select_frames` and `downscale`.
-        layout: see the module's description.
         path: a folder that does not exist or is empty.
         test_cameras: held out, in the way the layout can say it: a file of their own, or the first place.
         cloud: initial points; times are seconds since the first frame. None leaves them to the trainer.

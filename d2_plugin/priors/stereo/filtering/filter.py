@@ -68,10 +68,8 @@ def filter_depths(
 
     Args:
         grays: uint8 [H, W] per camera.
-        cameras: the cameras, in the same order.
         depths: raw planar depth float32 [H, W] per camera, 0 or NaN where the matcher has none.
         costs: matching cost 1 - NCC float32 [H, W] per camera.
-        settings: thresholds.
         tolerance: depths of one surface differ by less than this share.
 
     Returns:

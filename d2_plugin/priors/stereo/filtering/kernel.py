@@ -63,7 +63,6 @@ def run(name: str, maps: Mapping[str, np.ndarray], **numbers: Any) -> None:
     """Call the function of that name of `CALLS`; results are written into contiguous arrays among `maps`.
 
     Args:
-        name: of the function.
         maps: arrays by the pointer to them; `depth` or `inverse` [H, W] says the size.
         numbers: the other fields, small arrays as such.
     """
