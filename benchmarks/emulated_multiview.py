@@ -33,7 +33,6 @@ def emulated_multiview(
 
     Args:
         depths: true planar z [H, W] per view, 0 in the sky; NaN where nobody knows it: there confidence is 0.
-        cameras: their calibrations.
         seed: the bends depend on it, and on nothing of the instant but its surfaces.
         posed: poses were given to the network and scale follows them; else both are its own, up to a similarity.
         shrink: how many times smaller than the images the maps are.

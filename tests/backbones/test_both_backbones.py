@@ -51,7 +51,6 @@ def threads(request: pytest.FixtureRequest) -> Iterator[int]:
 def bend_field(model: SplatModel, strength: float = 0.02) -> None:
     """A deformation field, where there is one, moves its Gaussians."""
     if getattr(model, "field", None) is not None:
-        model.deforms = True
         with torch.no_grad():
             for parameter in model.field.heads.parameters():
                 parameter.uniform_(-strength, strength, generator=generator(1))
@@ -226,7 +225,7 @@ class TestInsertionIntoADeformationField:
         assert torch.isfinite(placed).all()
         assert (residual < 0.15).all(), "nobody is further off than two offsets"
 
-    def test_during_the_warm_up_canonical_space_is_the_world(self) -> None:
+    def test_with_a_new_field_canonical_space_is_the_world(self) -> None:
         model = make_model(backbone="hexplane")
         points = some_points(6)
         make_adapter(model).insert(points)

@@ -63,7 +63,6 @@ def bilinear(plane: torch.Tensor, row: torch.Tensor, column: torch.Tensor) -> to
 class TestFields:
     def test_motion_starts_from_none(self, kind: str) -> None:
         model = make_model(backbone=kind)
-        model.deforms = True
         still = model.offsets(model.gaussians["positions"], 0.3)
         assert all(not part.any() for part in still)
 

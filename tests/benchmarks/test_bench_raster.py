@@ -6,13 +6,14 @@ import pytest
 import torch
 
 from benchmarks.raster import RasterBench, run
-from benchmarks.raster_scenes import load_scene
+from benchmarks.raster_scenes import Scene, load_scene
 from d2_plugin.rasterizer import RasterSettings, reference
 from d2_plugin.runs.rows import read_rows
 
 
 def test_synthetic_gaussians_have_the_radius_and_the_frustum_they_are_described_with():
-    scene = load_scene("synth:4000", 640, 360).to(torch.float64)
+    made = load_scene("synth:4000", 640, 360)
+    scene = Scene(*(part.double() for part in made[:5]), made.view)
     screen = reference.project(scene.splats(), scene.view, RasterSettings())
     x, y, slope = screen.variance_x, screen.variance_y, screen.slope
     middle, covariance = (x + y) / 2, slope * y

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from benchmarks.stereo import StereoBench, run, tables
-from benchmarks.stereo_measure import Method, measure, methods, score
+from benchmarks.stereo_measure import VARIANTS, measure, score
 from benchmarks.stereo_rigs import Rig, textured_rig
 from d2_plugin.errors import D2Error
-from d2_plugin.priors.settings import StereoSettings
 from d2_plugin.runs.rows import read_rows
 
 pytest.importorskip("cv2")
@@ -48,23 +47,25 @@ def test_covisibility_without_the_other_truth_is_nearly_that_with_it(rig: Rig) -
     assert not alone.covisible[1].any()
 
 
-def test_a_method_that_fails_on_a_rig_says_why_and_counts_as_nothing(rig: Rig) -> None:
+def test_a_setting_that_fails_on_a_rig_says_why_and_counts_as_nothing(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def refuses(*_: object) -> list:
         raise D2Error("disparities span more than the image")
 
-    broken = Method("broken", "default", refuses, StereoSettings())
-    row = measure(broken, [rig])
+    working = measure("2 sources", VARIANTS["2 sources"], [rig])
+    monkeypatch.setattr("benchmarks.stereo_measure.patchmatch", refuses)
+    row = measure("2 sources", VARIANTS["2 sources"], [rig])
     assert row["failed"] == "disparities span more than the image"
-    working = {**measure(methods()[-1], [rig]), "method": "broken", "setting": "default"}
     (_, means), (_, every) = tables([row, working])
-    assert every.rows[0][:6] == ("synthetic2", "2", "192x108", "broken", "default", "failed")
-    assert means.rows[0][:3] == ("broken", "default", f"{working['completeness'] / 2:.3f}")
+    assert every.rows[0][:6] == ("synthetic2", "2", "192x108", "patchmatch", "2 sources", "failed")
+    assert means.rows[0][:3] == ("patchmatch", "2 sources", f"{working['completeness'] / 2:.3f}")
 
 
 def test_bench_adds_rows_and_prints_their_tables(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("benchmarks.stereo._set_threads", lambda count: None)
     path = tmp_path / "rows.jsonl"
-    told = run(StereoBench(rigs=("synthetic2",), width=96, makers=("patchmatch",), defaults_only=True, output=path))
+    told = run(StereoBench(rigs=("synthetic2",), width=96, defaults_only=True, output=path))
     assert "| synthetic2 | 2 | 96x54 | patchmatch | default |" in told
     rows = read_rows([path])
     assert [(row["method"], row["rig"], row["width"]) for row in rows] == [

@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 
 from benchmarks.stereo_rigs import textured_rig
-from d2_plugin.errors import D2Error
 from d2_plugin.priors.settings import StereoSettings
 from d2_plugin.priors.stereo.depth_range import depth_bounds
 from d2_plugin.priors.stereo.filtering.filter import GeometricDepth
-from d2_plugin.priors.stereo.geometric_depth import choose_matcher, enlarged, geometric_depth
+from d2_plugin.priors.stereo.geometric_depth import enlarged, geometric_depth
 from d2_plugin.recordings.recording import Recording
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 
@@ -148,10 +147,3 @@ def test_points_behind_or_beside_the_camera_do_not_count(pair: Recording) -> Non
     backwards = -5 * cameras[0].T_camera_world[2, :3]
     behind = cameras[0].centre + backwards + np.random.default_rng(0).normal(0, 0.1, (200, 3))
     assert "triangulated" not in depth_bounds(cameras, behind).origin
-
-
-def test_what_is_no_matcher_is_refused() -> None:
-    with pytest.raises(D2Error, match="did you mean 'patchmatch'"):
-        choose_matcher("patch-match")
-    with pytest.raises(D2Error, match="matcher = sensor reads depth that lies beside a recording"):
-        choose_matcher("sensor")

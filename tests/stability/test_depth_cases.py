@@ -27,7 +27,6 @@ def test_case_18_a_model_whose_gaussians_were_all_pruned_renders_the_background_
     backbone: str,
 ) -> None:
     model, view = make_model(backbone=backbone), make_views()[0]
-    model.deforms = True
     rows = {name: value.detach()[:2].clone() for name, value in model.gaussians.parameters.items()}
     model.select(torch.arange(0))
     background = torch.tensor([0.1, 0.2, 0.3])
