@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import importlib
-import json
 import math
 import pkgutil
 from collections.abc import Iterator
-from dataclasses import MISSING, asdict, dataclass, field
+from dataclasses import MISSING, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args, get_origin
 
@@ -125,23 +124,6 @@ def test_any_value_is_refused_in_one_sentence_with_its_name_or_kept_and_python_i
         assert not isinstance(number, (int, float)) or isinstance(number, bool) or limits.holds(number)
 
 
-@given(
-    st.builds(
-        Example,
-        start=st.integers(0, 10**6),
-        kind=st.sampled_from(["relative", "metric"]),
-        weight=st.floats(1e-9, 1e9),
-        stop=st.none() | st.integers(0, 9),
-        tau=st.just("auto") | st.floats(1e-9, 1e9),
-        levels=st.lists(st.integers(1, 99), max_size=4),
-        bounds=st.none() | st.tuples(st.floats(1e-3, 1), st.floats(1, 9)),
-        maybe=st.none() | st.builds(Inner, part=st.floats(0, 1)),
-    )
-)
-def test_settings_survive_json(settings: Example) -> None:
-    assert Example.from_dict(json.loads(json.dumps(asdict(settings)))) == settings
-
-
 def test_whole_numbers_become_floats_and_lists_tuples() -> None:
     made = Example(weight=2, levels=[3, 4], bounds=[1, 2], folder="a/b")
     assert (made.weight, made.levels, made.bounds, made.folder) == (2.0, (3, 4), (1.0, 2.0), Path("a/b"))
@@ -187,17 +169,6 @@ def test_a_setting_without_a_default_is_asked_for() -> None:
     with pytest.raises(D2Error, match="recording must have name: add what is missing"):
         Needy.from_dict({"count": 1}, "recording")
     assert declared(Needy)[0].default is MISSING
-
-
-def test_help_range_unit_and_place_are_found() -> None:
-    assert [name for name, setting in NAMES.items() if setting.positional] == ["name"]
-    assert NAMES["start"].help == "The first step of all."
-    assert NAMES["kind"].help == "What the network returns."
-    assert NAMES["inner"].help == "A table inside."
-    assert NAMES["reach"].range.unit == "m"
-    assert NAMES["start"].range == Range(0, unit="steps")
-    assert NAMES["levels"].default == (1, 2)
-    assert next(iter(NAMES)) == "start", "a base's settings come first"
 
 
 def every_settings_class() -> list[type[Settings]]:

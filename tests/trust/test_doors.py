@@ -18,7 +18,6 @@ from d2_plugin.cache import Untrusted, cache_folder, check_private
 from d2_plugin.commands import cli
 from d2_plugin.commands.cli import main
 from d2_plugin.errors import D2Error
-from d2_plugin.reading import Unreadable, parse_json, parse_toml
 from d2_plugin.recordings.cameras.calibration import read_calibration
 from d2_plugin.recordings.cameras.formats.document import Document
 from d2_plugin.recordings.importing.settings import by_camera, finite
@@ -47,7 +46,9 @@ def test_a_comparison_of_no_run_is_refused(refused: Refused) -> None:
 
 def test_nothing_is_written_inside_the_images_of_a_recording(recording: Path, tmp_path: Path, refused: Refused) -> None:
     (tmp_path / "room").symlink_to(recording)
-    for place in (recording / "images" / "zz", tmp_path / "room" / "images" / "zz" / "deeper"):
+    images = recording / "images"
+    before = {path: path.stat().st_mtime_ns for path in images.rglob("*")}
+    for place in (images, images / "cam00", images / "zz", tmp_path / "room" / "images" / "zz" / "deeper"):
         of_two, run = ["--train-cameras", "cam00,cam01"], tmp_path / "run"
         for words in (
             ["train", recording, *of_two], ["priors", recording, *of_two], ["ablate", recording, *of_two], ["demo"],
@@ -59,17 +60,7 @@ def test_nothing_is_written_inside_the_images_of_a_recording(recording: Path, tm
         assert "where every folder is a camera" in refused("compare", run, "--page", place / "deep.html")
         with pytest.raises(D2Error, match="where every folder is a camera"):
             PriorStore.create(place, ["a"], [0], {})
-    assert not (recording / "images" / "zz").exists()
-
-
-@pytest.mark.parametrize("hooks", ["all", "none"])
-@pytest.mark.parametrize("value", ["5", "{ scale = 1.0 }"])
-def test_a_hook_inside_another_table_is_refused(
-    recording: Path, tmp_path: Path, refused: Refused, hooks: str, value: str
-) -> None:
-    (tmp_path / "d2.toml").write_text(f"[d2]\ndensify = {value}\n")
-    words = ["train", recording, "--train-cameras", "cam00,cam01", "--hooks", hooks, "--output", tmp_path / "run"]
-    assert "d2.densify is a table of its own" in refused(*words, "--config", tmp_path / "d2.toml")
+    assert {path: path.stat().st_mtime_ns for path in images.rglob("*")} == before
 
 
 @pytest.mark.parametrize(
@@ -93,14 +84,6 @@ def test_no_text_takes_long(tmp_path: Path, text: str) -> None:
     assert time.process_time() - start < 20
 
 
-def test_a_list_of_yaml_is_what_it_says(tmp_path: Path) -> None:
-    (tmp_path / "rig.yml").write_text("a: {b: 1, c: [x, y, {d: 'e'}]}\nf:\n- 1\n- g: ''\n")
-    assert Document(tmp_path / "rig.yml").content == {
-        "a": {"b": "1", "c": ["x", "y", {"d": "e"}]},
-        "f": ["1", {"g": ""}],
-    }
-
-
 @pytest.mark.parametrize("text", ["a: 1\n---\nb: 2\n", "a: 1\n? [x, y]\n: c\n", "a: &x 1\nb: *x\n"])
 def test_yaml_that_no_calibration_needs_is_refused(tmp_path: Path, text: str) -> None:
     (tmp_path / "rig.yml").write_text(text)
@@ -117,36 +100,6 @@ def test_a_sentence_that_repeats_a_damaged_file_is_short(tmp_path: Path) -> None
         read_calibration(tmp_path / "camchain.yaml")
     assert len(str(refusal.value)) < 1300
     assert str(refusal.value).endswith("calibrate it with Kalibr's pinhole-equi or pinhole-radtan")
-
-
-def test_a_name_that_stands_twice_is_named() -> None:
-    with pytest.raises(Unreadable, match="the name 'b' stands twice"):
-        parse_json('{"a": 1, "b": 2, "b": 3}', "x")
-    assert parse_toml("a.b = 1.5\n", "x") == {"a": {"b": 1.5}}
-
-
-FLAGS = """
---d2.views-per-evaluation 1000000000 | --densify.scale 10000000000000000000000000 | --densify.lifetime 1e300
---densify.spacing 10000000000000000000000000 | --densify.tau-u 10000000000000000000000000
---prune.patience 1000000000 | --depth-loss.epsilon 10000000000000000000000000 | --depth-loss.epsilon 1e-320
---prune.tau-u 1e-320 | --priors.stereo.patchmatch-sources 2000000000 | --priors.stereo.min-sources 2000000000
---priors.mono-threads 1000000000 | --priors.stereo.max-pixels 1000000000000
---priors.stereo.reuse-block 1e25 | --priors.tau-c 1e300 | --priors.conflict-sigmas 1e-320
---priors.align.epsilon 1e-320 | --priors.align.min-anchors 1e25 | --priors.depth-range 1e-320,1
---priors.depth-range 1,1e300 | --backbone.sh-time-degree 10000000000000000000000000 | --backbone.position-rate 1e38
---backbone.densify.budget 10000000000000000000 | --iterations 10000000000000000000 | --downscale 10000000000000000000
---d2.prior-memory-mb 10000000000000000000 | --d2.finite-every 10000000000000000000
-"""
-
-
-def test_every_setting_has_both_bounds_on_the_command_line(recording: Path, tmp_path: Path, refused: Refused) -> None:
-    words = ["train", recording, "--train-cameras", "cam00,cam01", "--output", tmp_path / "run"]
-    for flags in FLAGS.strip().replace("\n", " | ").split(" | "):
-        name, value = flags.split()
-        said = refused(*words, name, value)
-        assert f"setting {name}" in said, said
-        assert " must be " in said, said
-    assert not list(tmp_path.iterdir())
 
 
 def test_a_cache_that_cannot_be_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
