@@ -9,7 +9,7 @@ import pytest
 import torch
 from tiny import make_adapter, make_model, make_trainer, make_views, parameters
 
-from d2_plugin.backbones.deform import Deform, create
+from d2_plugin.backbones.deform import Deform
 from d2_plugin.backbones.deform_fields import (
     Box,
 )
@@ -136,16 +136,6 @@ class TestModel:
         assert (((positions[1:] - box.centre) / box.reach).abs() <= 1.05).all()
         assert torch.isfinite(Box.around(torch.zeros(0, 3), 2.0).reach).all()
         assert (Box.around(torch.ones(1, 3), 2.0).reach > 0).all()
-
-
-def test_settings_arrive_through_the_entry_point() -> None:
-    model = create(
-        torch.rand(4, 3), torch.rand(4, 3), torch.zeros(4), extent=1.0, duration=1.0, temporal=True,
-        settings={"field": "hexplane", "sh_degree": 1, "hexplane": {"features": 5}, "densify": {"every": 9}},
-    )  # fmt: skip
-    assert model.gaussians["harmonics"].shape == (4, 3, 3)
-    assert model.field.space[0].shape[1] == 5
-    assert model.settings.densify.every == 9
 
 
 def test_d2_train_runs_and_scores_it(tmp_path: Path) -> None:

@@ -7,12 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.stereo import StereoBench, run, tables
+from benchmarks.stereo import tables
 from benchmarks.stereo_measure import Method, measure, methods, score
 from benchmarks.stereo_rigs import Rig, textured_rig
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.settings import StereoSettings
-from d2_plugin.runs.rows import read_rows
 
 pytest.importorskip("cv2")
 
@@ -59,15 +58,3 @@ def test_a_method_that_fails_on_a_rig_says_why_and_counts_as_nothing(rig: Rig) -
     (_, means), (_, every) = tables([row, working])
     assert every.rows[0][:6] == ("synthetic2", "2", "192x108", "broken", "default", "failed")
     assert means.rows[0][:3] == ("broken", "default", f"{working['completeness'] / 2:.3f}")
-
-
-def test_bench_adds_rows_and_prints_their_tables(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("benchmarks.stereo._set_threads", lambda count: None)
-    path = tmp_path / "rows.jsonl"
-    told = run(StereoBench(rigs=("synthetic2",), width=96, makers=("patchmatch",), defaults_only=True, output=path))
-    assert "| synthetic2 | 2 | 96x54 | patchmatch | default |" in told
-    rows = read_rows([path])
-    assert [(row["method"], row["rig"], row["width"]) for row in rows] == [
-        ("patchmatch", "synthetic2", 96),
-    ]
-    assert all(row["kind"] == "stereo" and row["error"] == 1 - row["f1"] and row["cpu"] > 0 for row in rows)

@@ -7,13 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.never_worse.bench import BACKBONE, STEREO, NeverWorseBench, run
 from benchmarks.never_worse.maps import SPOILED, Spoiled, spoiled_recording
 from d2_plugin.priors.settings import PriorSettings
 from d2_plugin.recordings import open_recording
 from d2_plugin.recordings.export.folder import save_recording
 from d2_plugin.recordings.synthetic.room import synthetic_recording
-from d2_plugin.runs.rows import read_rows
 
 pytest.importorskip("cv2")
 
@@ -54,19 +52,3 @@ def test_each_map_is_what_its_name_says(room: Path, tmp_path: Path) -> None:
     assert np.allclose(other, before.mono(cameras[0], before.frames[1]), atol=1e-2)
     alone = spoiled("other", (0,), "one frame")
     assert np.allclose(alone, before.mono(cameras[1], 0), atol=1e-2), "with one frame it is another camera's"
-
-
-@pytest.mark.slow
-def test_rows_are_written_once_and_a_rerun_does_nothing(room: Path, tmp_path: Path) -> None:
-    names = list(open_recording(room).cameras)
-    given = f"{room}@{names[0]}+{names[1]}@{names[2]}"
-    settings = NeverWorseBench((given,), maps=("own", "noise"), steps=3, jobs=1, output=tmp_path)
-    told = run(settings)
-    rows = read_rows([tmp_path / "never-worse.jsonl"])
-    assert [r["method"] for r in rows] == [BACKBONE, STEREO, "own", "noise"]
-    assert all(r["failed"] is None for r in rows)
-    assert rows[0]["prior"] is None
-    assert "usable" in rows[3]["prior"]
-    assert "| stereo alone |" in told
-    run(settings)
-    assert read_rows([tmp_path / "never-worse.jsonl"]) == rows

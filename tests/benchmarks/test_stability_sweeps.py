@@ -5,13 +5,12 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
 
 from benchmarks.stability.gaussians import difference, largest, random_rotation, random_scene
-from benchmarks.stability.sweep import SWEEPS, StabilitySettings, measure, run, run_sweeps, tables
+from benchmarks.stability.sweep import SWEEPS, measure, run_sweeps, tables
 from d2_plugin.errors import D2Error
 from d2_plugin.runs.rows import Row
 
@@ -64,14 +63,3 @@ def test_a_scene_that_is_another_one_is_seen_to_differ() -> None:
     image = scene.render(torch.float64)
     assert difference(scene.turned(random_rotation(3)).render(torch.float64), image) < 1e-12
     assert difference(scene._replace(means=scene.means + 1e-3).render(torch.float64), image) > 1e-4
-
-
-def test_the_command_appends_rows_and_prints_a_line_per_sweep(tmp_path: Path) -> None:
-    output = tmp_path / "runs.jsonl"
-    first, told = (run(StabilitySettings(("epsilon",), output)) for _ in range(2))
-    assert first == told
-    found = [json.loads(line) for line in output.read_text().splitlines()]
-    assert len(found) == 2 * 2 * len(SWEEPS["epsilon"].values)
-    assert found[0]["command"].startswith("d2 bench stability --sweeps epsilon")
-    assert "| epsilon | float32 | smoothing over median depth: 1e-08 .. 0.1 | 8 | 8 |" in told
-    assert str(output) in told

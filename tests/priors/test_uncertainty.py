@@ -15,7 +15,6 @@ from d2_plugin.priors.monocular.correct import corrected_depth, corrected_withou
 from d2_plugin.priors.monocular.extrapolation import extrapolation_error
 from d2_plugin.priors.monocular.settings import AlignSettings
 from d2_plugin.priors.monocular.uncertainty import monocular_uncertainty
-from d2_plugin.priors.settings import AlignSettings
 from d2_plugin.protocol import Label
 from d2_plugin.recordings.recording import MonoKind
 from d2_plugin.recordings.synthetic.room import synthetic_recording
