@@ -21,7 +21,7 @@ from tiny import (
     parameters,
     same,
 )
-from tiny import with_sky as of_the_gaussians
+from tiny import parameters as of_the_gaussians
 from torch import Tensor
 
 from d2_plugin.backbones import background as module

@@ -178,28 +178,6 @@ class TestPlaces:
         (copy / "cameras.json").write_text(json.dumps(described))
         assert "rename it" in refused("plan", str(copy), "--train-cameras", "cam01")
 
-    @pytest.mark.parametrize(
-        ("key", "value"),
-        [
-            *(("fx", focal) for focal in (0, 1e-30, 1e30)),
-            *(("t", place) for place in ([1e30, 0, 0], [1])),
-            *(("R", turn) for turn in ("x", [[0] * 3] * 3)),
-            *(("width", width) for width in (-1, 10**9, 1e300)),
-            ("cx", 1e30),
-        ],
-    )
-    def test_a_calibration_that_cannot_be(self, copy: Path, refused: Refused, key: str, value: object) -> None:
-        described = json.loads((copy / "cameras.json").read_text())
-        described["cameras"][0][key] = value
-        (copy / "cameras.json").write_text(json.dumps(described))
-        assert "cam00" in refused("plan", str(copy), "--train-cameras", "cam00,cam01")
-
-    @pytest.mark.parametrize("fps", [1e-300, 1e300, 0, -1, "30", None])
-    def test_a_frame_rate_that_cannot_be(self, copy: Path, refused: Refused, fps: object) -> None:
-        described = json.loads((copy / "cameras.json").read_text())
-        (copy / "cameras.json").write_text(json.dumps(described | {"fps": fps}))
-        assert "fps" in refused("plan", str(copy), "--train-cameras", "cam00,cam01")
-
     def test_a_depth_map_that_only_evaluation_reads_is_named_before_training(
         self, copy: Path, tmp_path: Path, refused: Refused
     ) -> None:

@@ -20,7 +20,6 @@ from d2_plugin.gaussians.rotation4d import (
     condition_on_time,
     covariances_from_factors,
     normalized_quaternions,
-    rotation_matrices_3d,
     rotation_matrices_4d,
     temporal_marginal,
     time_row,
@@ -77,25 +76,6 @@ def test_where_float32_is_short_of_digits_the_kernel_loses_no_more_than_torch() 
     for name, expected in exact_gradients.items():
         allowed = 2e-6 + 1.5 * relative_error(plain_gradients[name], expected)
         assert relative_error(native_gradients[name], expected) < allowed, name
-
-
-@pytest.mark.parametrize("name", GOLDEN)
-def test_kernel_agrees_with_the_reference_implementation(name: str) -> None:
-    mean, mean_time, scales, left, right, instant, at, covariance, marginal, _, _ = GOLDEN[name]
-    rows = {
-        "positions": torch.tensor([mean], dtype=torch.float32),
-        "log_scales": torch.tensor([scales[:3]]).log(),
-        "left": torch.tensor([left], dtype=torch.float32),
-        "opacity_logits": torch.zeros(1),
-        "times": torch.tensor([mean_time]),
-        "log_time_scales": torch.tensor(scales[3:]).log(),
-        "right": torch.tensor([right], dtype=torch.float32),
-    }
-    means, covariances, opacities, drawn = native_slice(rows, instant, *CONSTANTS)
-    assert drawn.tolist() == [0]
-    torch.testing.assert_close(means[0], torch.tensor(at, dtype=torch.float32), atol=5e-7, rtol=1e-6)
-    torch.testing.assert_close(covariances[0], torch.tensor(covariance, dtype=torch.float32), atol=2e-8, rtol=1e-5)
-    torch.testing.assert_close(opacities[0], torch.tensor(0.5 * marginal), atol=0, rtol=1e-6)
 
 
 def test_the_number_of_threads_changes_no_bit(temporal: bool, same_for_any_threads: Callable) -> None:
@@ -194,14 +174,6 @@ def test_rotations_are_proper_and_time_row_is_their_last_row() -> None:
     torch.testing.assert_close(matrices @ matrices.mT, torch.eye(4, dtype=torch.float64).expand_as(matrices))
     torch.testing.assert_close(torch.linalg.det(matrices), torch.ones(200, dtype=torch.float64))
     torch.testing.assert_close(time_row(left, right), rotation[3])
-
-
-def test_equal_quaternions_leave_time_alone_and_rotate_space_with_x_and_z_swapped() -> None:
-    q = random_quaternions(2, 50)
-    rotation = rotation_matrices_4d(q, q)
-    swap = torch.tensor([2, 1, 0])
-    torch.testing.assert_close(rotation[:3, :3], rotation_matrices_3d(q)[swap][:, swap])
-    torch.testing.assert_close(rotation[3], tensor(0, 0, 0, 1)[:, None].expand(4, 50))
 
 
 def test_factor_form_equals_the_schur_complement_in_float64() -> None:
@@ -362,17 +334,6 @@ def test_the_marginal_depends_on_standard_deviations_alone(take_slice, variance:
     torch.testing.assert_close(found.opacities[0].item(), 0.5 * marginal, rtol=1e-5, atol=0)
     by_time = found.gradients["times"][0].item() * sigma
     torch.testing.assert_close(by_time, 0.5 * marginal * deviations, rtol=1e-5, atol=1e-12)
-
-
-def test_the_factor_keeps_positive_what_the_schur_complement_loses() -> None:
-    generator = torch.Generator().manual_seed(0)
-    left, right = (normalized_quaternions(torch.randn(4, 2000, generator=generator)) for _ in range(2))
-    factors = rotation_matrices_4d(left, right) * torch.tensor([1e-2, 1e-2, 1e-3, 100.0])[:, None]
-    sigma = torch.einsum("ikn,jkn->nij", factors, factors)
-    schur = sigma[:, :3, :3] - sigma[:, :3, 3:] * sigma[:, None, 3, :3] / sigma[:, 3:, 3:]
-    spatial = condition_on_time(factors)[0].double().movedim(-1, 0)
-    assert (torch.linalg.eigvalsh(schur.double())[:, 0] <= 0).double().mean() > 0.5, "this test could not fail"
-    assert (torch.linalg.eigvalsh(spatial @ spatial.mT)[:, 0] > 0).all()
 
 
 def test_a_slice_of_a_long_life_is_positive_definite_as_the_rasterizer_gets_it(take_slice) -> None:

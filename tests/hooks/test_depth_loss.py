@@ -17,7 +17,7 @@ from d2_plugin.hooks import depth_loss as module
 from d2_plugin.hooks import native_depth_loss
 from d2_plugin.hooks import prior as loading
 from d2_plugin.hooks.densify import Densify, DensifyConfig, under_reconstructed
-from d2_plugin.hooks.depth_loss import DepthLoss, DepthLossConfig, charbonnier, depth_loss, supervision
+from d2_plugin.hooks.depth_loss import DepthLoss, DepthLossConfig, supervision
 from d2_plugin.hooks.hook import Context
 from d2_plugin.hooks.prior import FAR, JUDGES, KnownMaps, PriorLoader
 from d2_plugin.hooks.rendered_depth import rendered_depth
@@ -30,14 +30,6 @@ LABELS = (Label.EMPTY, Label.MONO, Label.VERIFIED, Label.CONFLICT, Label.AGREED,
 
 def tensor(*values: float) -> Tensor:
     return torch.tensor(values)
-
-
-class TestThePapersLoss:
-    def test_counts_only_pixels_that_are_trusted_and_validly_rendered(self) -> None:
-        depth, prior = tensor(2.0, 2.0, 2.0), tensor(1.0, 4.0, 8.0)
-        valid, verified = torch.tensor([True, True, False]), torch.tensor([True, False, True])
-        expected = charbonnier(tensor(1.0), 0.01).squeeze()
-        torch.testing.assert_close(depth_loss(depth, valid, prior, verified, 0.01), expected)
 
 
 def prior_of(seed: int, height: int, width: int, labels: tuple[Label, ...] = LABELS, paper: bool = False) -> DepthPrior:
@@ -366,20 +358,6 @@ class TestStiff:
         assert not by_sum[0, 5:9].any(), "no depth, no sigma, or alpha an ulp below tau_v"
         assert by_sum[0, [0, 2, 3]].gt(0).all()
         assert by_sum[0, [1, 9]].lt(0).all()
-
-    def test_alpha_at_tau_v_itself_does_not_count(self) -> None:
-        pixels = known(DepthPrior(torch.ones(1, 1), torch.full((1, 1), int(Label.FAR), dtype=torch.uint8)))
-        z = torch.full((1, 1), 0.1, requires_grad=True)
-        for alpha, counts in ((0.5, False), (0.5000001, True)):
-            loss, slope = gradients(supervision(z, torch.full((1, 1), alpha), pixels, CONFIG), z)
-            assert (loss > 0) == counts == bool(slope.any())
-
-    @pytest.mark.parametrize("label", [Label.EMPTY, Label.MONO, Label.CONFLICT])
-    def test_a_view_without_a_known_pixel_adds_nothing(self, label: Label) -> None:
-        labels = torch.full((2, 2), int(label), dtype=torch.uint8)
-        loader, view = loader_of(DepthPrior(torch.ones(2, 2), labels, sigma=torch.full((2, 2), torch.inf)))
-        hook = DepthLoss(CONFIG)
-        assert hook.loss(Context(1, SimpleNamespace(), [view], loader, torch.Generator())) is None
 
     def test_a_view_of_far_pixels_alone_is_supervised(self) -> None:
         labels = torch.full((2, 2), int(Label.FAR), dtype=torch.uint8)

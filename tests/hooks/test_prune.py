@@ -137,14 +137,6 @@ def test_a_run_with_the_papers_sigma_is_bitwise_the_run_without_sigma(monkeypatc
     assert same(parameters(runs[0]), parameters(with_term)), "without sigma no space is known to be free"
 
 
-def test_a_survey_without_sigma_has_no_front() -> None:
-    splats, views, prior = scattered(0), [double(view) for view in make_views()[:1]], TinyStore().prior("", 0)
-    for paper in (prior, papers_sigma(prior)):
-        assert not context(splats, views, paper).evaluation[0].survey.front.any(), "the paper knows no free space"
-    measured = prior._replace(sigma=torch.where(prior.trusted, 0.01, torch.inf))
-    assert context(splats, views, measured).evaluation[0].survey.front.any()
-
-
 VERIFIED, UNCERTAIN, BEYOND = 5, 16, 27
 """Columns in the middle of three bands: exact, sigma .2 (free up to 1.2 = 3 (1 - 3 x .2)), far beyond 50."""
 

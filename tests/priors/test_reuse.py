@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from d2_plugin.errors import D2Error
 from d2_plugin.priors.build import PriorSettings, build_priors
 from d2_plugin.priors.settings import StereoSettings
 from d2_plugin.priors.stereo.geometric_depth import geometric_depth
@@ -105,9 +104,3 @@ def test_a_build_that_stopped_within_a_block_goes_on_to_the_same_store(
         build_priors(recording, NAMES, tmp_path, SETTINGS, progress=stop)
     build_priors(recording, NAMES, tmp_path, SETTINGS)
     assert priors_of(tmp_path) == priors_of(built)
-
-
-@pytest.mark.parametrize("shard", [(2, 2), (-1, 2), (0, 0)])
-def test_a_shard_that_does_not_exist_is_refused(recording: Recording, tmp_path: Path, shard: tuple[int, int]) -> None:
-    with pytest.raises(D2Error, match="does not exist"):
-        build_priors(recording, NAMES, tmp_path, SETTINGS, shard=shard)

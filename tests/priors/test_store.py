@@ -301,14 +301,6 @@ def test_names_that_no_folder_can_have_get_one(tmp_path: Path) -> None:
         assert store.path.parent == tmp_path / "cameras"
 
 
-def test_what_a_killed_build_left_is_removed_by_the_next(recording: Recording, tmp_path: Path) -> None:
-    built(recording, tmp_path)
-    left = tmp_path / "priors" / "train0" / ".0123456789abcdef.part"
-    left.write_bytes(b"half a file")
-    built(recording, tmp_path)
-    assert not left.exists()
-
-
 def test_a_header_that_lies_is_refused(recording: Recording, tmp_path: Path) -> None:
     built(recording, tmp_path)
     array = tmp_path / "priors" / "train0" / "00000.npy"

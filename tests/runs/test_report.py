@@ -171,13 +171,6 @@ def test_a_file_that_no_report_wrote_is_kept(tmp_path: Path, name: str) -> None:
     assert [path.name for path in tmp_path.iterdir()] == [name]
 
 
-def test_what_a_killed_report_left_is_removed_by_the_next(tmp_path: Path) -> None:
-    (tmp_path / ".0123456789abcdef.part").write_text("half a page")
-    for _ in range(2):  # and an earlier report is replaced
-        assert make_report(committed(), tmp_path)[0].is_file()
-    assert not list(tmp_path.glob(".*"))
-
-
 def test_what_names_hold_is_text_and_never_markup(tmp_path: Path) -> None:
     row = scored("yang4d a&b", 0, psnr=20.0) | {"case": "<b>room</b>"}
     page, *_ = make_report([row], tmp_path, [Image("<i>x</i>", "data:image/png;base64,")])

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import io
 import math
-import random
-from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -24,7 +22,6 @@ from d2_plugin.hooks.finite import Diverged
 from d2_plugin.locks import only_writer
 from d2_plugin.recordings.export.folder import save_recording
 from d2_plugin.recordings.synthetic.room import synthetic_recording
-from d2_plugin.runs import run as run_module
 from d2_plugin.runs.run import Run
 from d2_plugin.runs.saved import METRICS, load_checkpoint, read_metrics, save_checkpoint, watched, what_diverged
 from d2_plugin.runs.settings import RunSettings
@@ -64,14 +61,6 @@ def copied(finished: Path, tmp_path: Path) -> Path:
     return tmp_path
 
 
-BROKEN: dict[str, Callable[[bytes], bytes]] = {
-    "empty": lambda whole: b"",
-    "cut off": lambda whole: whole[: len(whole) // 2],
-    "another shape": lambda whole: b"[1, 2]",
-    "noise": lambda whole: random.Random(0).randbytes(len(whole)),
-}
-
-
 def written(path: Path, values: dict[str, Any]) -> None:
     """Values in the way in which checkpoints and points are written."""
     content = io.BytesIO()
@@ -80,10 +69,10 @@ def written(path: Path, values: dict[str, Any]) -> None:
 
 
 class TestADamagedFile:
-    @pytest.mark.parametrize("how", BROKEN)
     @pytest.mark.parametrize("name", ["checkpoint.pt", "run.json", "points.npz"])
-    def test_is_one_sentence(self, copied: Path, capsys: pytest.CaptureFixture[str], name: str, how: str) -> None:
-        (copied / name).write_bytes(BROKEN[how]((copied / name).read_bytes()))
+    def test_is_one_sentence(self, copied: Path, capsys: pytest.CaptureFixture[str], name: str) -> None:
+        whole = (copied / name).read_bytes()
+        (copied / name).write_bytes(whole[: len(whole) // 2])
         assert main(["eval", str(copied), "--no-images"]) == 2
         told = capsys.readouterr().err
         assert name in told
@@ -214,12 +203,6 @@ class TestOneWriter:
         run.train()
         run.train()
 
-    def test_what_a_kill_left_of_the_first_file_blocks_nobody(self, scene: Path, tmp_path: Path) -> None:
-        (tmp_path / "run").mkdir()
-        (tmp_path / "run" / ".0123456789abcdef.part").write_bytes(b'{"iter')
-        bare(scene, tmp_path / "run").train()
-        assert not list((tmp_path / "run").glob(".*.part"))
-
     def test_a_file_in_the_place_of_the_folder_is_told(self, scene: Path, tmp_path: Path) -> None:
         (tmp_path / "run").write_text("mine")
         with pytest.raises(D2Error, match="is a file, expected a folder: choose another place"):
@@ -257,21 +240,3 @@ class TestThePriorOfARun:
     def test_without_hooks_none_is_needed(self, scene: Path, tmp_path: Path) -> None:
         assert main(self.words(scene, tmp_path / "run", "--hooks", "none")) == 0
         assert read_metrics(tmp_path / "run")["prior"] is None
-
-
-def test_the_checkpoint_before_is_there_when_the_next_cannot_be_written(
-    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    run = bare(scene, tmp_path / "run", iterations=6)
-    save, saved = run_module.save_checkpoint, []
-
-    def full(path: Path, state: Any) -> None:
-        if len(saved) == 3:
-            raise D2Error("cannot write")
-        saved.append(state["step"])
-        save(path, state)
-
-    monkeypatch.setattr(run_module, "save_checkpoint", full)
-    with pytest.raises(D2Error, match="cannot write"):
-        run.train()
-    assert load_checkpoint(run.folder / "checkpoint.pt", "cpu")["step"] == 3

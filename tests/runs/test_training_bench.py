@@ -1,4 +1,4 @@
-"""`d2 bench training`: equal CPU time, rows as they finish, reruns do what is missing; workers end with their parent."""
+"""`d2 bench training`: equal CPU time, rows as they finish, reruns of what lacks; workers end with their parent."""
 
 from __future__ import annotations
 
