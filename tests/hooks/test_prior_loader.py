@@ -6,7 +6,6 @@ import threading
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -114,17 +113,6 @@ def test_a_failure_ahead_is_raised_when_its_view_comes(store: PriorStore) -> Non
     assert loader(view_of(2)) is not None
     with pytest.raises(Exception, match="camera of the prior store"):
         loader(replace(view_of(0), camera="nobody"))
-
-
-def test_an_array_that_was_intact_is_not_checked_again(store: PriorStore, monkeypatch: pytest.MonkeyPatch) -> None:
-    from d2_plugin.store import files
-
-    checks: list[Any] = []
-    original = files.Entry.checksum_problem
-    monkeypatch.setattr(files.Entry, "checksum_problem", lambda entry: checks.append(1) or original(entry))
-    for _ in range(3):
-        store.coded("cam0", 0)
-    assert len(checks) == 1
 
 
 def test_d2_reads_ahead_what_a_trainer_says_comes_next(store: PriorStore) -> None:

@@ -103,16 +103,3 @@ def test_without_dask_its_extra_is_named(recording: Recording, tmp_path: Path, m
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(MissingExtra, match=r"dask.distributed, which is not installed: .*d2-4dgs\[cluster\]"):
         build_priors_on_cluster(recording, NAMES, tmp_path / "p", SETTINGS)
-
-
-def test_summaries_of_parts_join_to_the_summary_of_the_whole(
-    recording: Recording, alone: tuple, tmp_path: Path
-) -> None:
-    joined = PriorSummary()
-    for index in (1, 0, 2):
-        joined.add_part(build_priors(recording, NAMES, tmp_path / "p", SETTINGS, shard=(index, 3)))
-    whole = alone[1]
-    assert (joined.built, joined.kept, joined.notes) == (whole.built, whole.kept, whole.notes)
-    for camera in NAMES:
-        assert joined.shares[camera] == pytest.approx(whole.shares[camera])
-    assert contents(tmp_path / "p") == alone[0]

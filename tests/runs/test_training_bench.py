@@ -25,7 +25,6 @@ from d2_plugin.runs.rows import TRY, Row, make_row
 from d2_plugin.runs.settings import RunSettings
 from d2_plugin.runs.shared import Shared
 from d2_plugin.runs.training.bench import (
-    PILOT,
     TOLERANCE,
     Case,
     Method,
@@ -42,9 +41,6 @@ SETTINGS = RunSettings("room", ("a", "b"))
 
 
 class TestBudget:
-    def test_the_first_try_is_the_pilot(self) -> None:
-        assert next_steps(10, []) == PILOT
-
     @given(law=st.floats(0.9, 1.6), cost=st.floats(1e-3, 1e-1), target=st.floats(5, 200))
     def test_a_power_law_is_met_within_three_tries(self, law: float, cost: float, target: float) -> None:
         tried: list[tuple[int, float]] = []
@@ -59,9 +55,6 @@ class TestBudget:
 
     def test_noise_between_two_near_lengths_does_not_turn_the_law_around(self) -> None:
         assert 100 < next_steps(20, [(100, 10.0), (101, 9.0)]) < 300
-
-    def test_the_nearest_is_so_in_ratio(self) -> None:
-        assert nearest(10, [(1, 5.0), (2, 19.0)]) == 2
 
 
 class TestCases:
