@@ -255,6 +255,8 @@ def run(table: dict[str, Any]) -> RunSettings:
         (D2Config.from_dict, {"version": 2}, r"the configuration has settings of version 2, and this d2-4dgs reads"),
         (deform.settings_from, {"hexplane": {"resolutions": []}}, r"resolutions has 0 levels: give one to eight"),
         (deform.settings_from, {"hexplane": {"resolutions": [1] * 9}}, r"resolutions has 9 levels: give one to eight"),
+        (deform.settings_from, {"hexplane": {"instants": 1001}}, r"instants must be .* at most 1000"),
+        (deform.settings_from, {"mlp": {"width": 8192}}, r"width must be .* at most 1024"),
         (deform.settings_from, {"field": "hexplan"}, r"unknown backbone\.field 'hexplan': have hexplane, mlp; did you"),
         (PriorSettings.from_dict, {"depth_range": [9.0, 1.0]}, "0 < near < far"),
         (PriorSettings.from_dict, {"stereo": {"min_angle": 60.0}}, "min_angle must be below max_angle, got 60 and 60"),
