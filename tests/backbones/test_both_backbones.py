@@ -191,7 +191,6 @@ def test_a_time_that_is_not_a_number_is_refused(backbone: str) -> None:
 
 
 class TestInsertionIntoADeformationField:
-
     def test_during_the_warm_up_canonical_space_is_the_world(self) -> None:
         model = make_model(backbone="hexplane")
         points = some_points(6)

@@ -20,7 +20,6 @@ from d2_plugin.recordings.recording import MonoKind
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 
 cv2 = pytest.importorskip("cv2")
-pytest.importorskip("cv2")
 
 
 SETTINGS = AlignSettings()
