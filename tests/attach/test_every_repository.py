@@ -88,7 +88,7 @@ class TestAdapter:
         assert isinstance(make().backbone, Backbone)
         assert {"moments", "grow"} <= set(check_backbone(make))
 
-    @settings(max_examples=30, deadline=None)
+    @settings(max_examples=15, deadline=None)
     @given(data=st.data())
     def test_rows_are_followed_through_any_edits(self, name: str, data: st.DataObject) -> None:
         """Rows are numbered anew before every edit; the reports to listeners must lead back to the numbers."""

@@ -114,7 +114,7 @@ def apply(action: str, seed: int, adapter: Backbone, model: SplatModel) -> None:
 
 
 @pytest.mark.parametrize("name", BACKBONES)
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(sequence=edits)
 def test_every_per_gaussian_state_stays_on_its_row(name: str, sequence: list[tuple[str, int]]) -> None:
     """Numbers follow the reports; parameters, Adam moments, statistics and pruning streaks must have followed too."""

@@ -359,6 +359,13 @@ class TestStiff:
         assert by_sum[0, [0, 2, 3]].gt(0).all()
         assert by_sum[0, [1, 9]].lt(0).all()
 
+    def test_alpha_at_tau_v_itself_does_not_count(self) -> None:
+        pixels = known(DepthPrior(torch.ones(1, 1), torch.full((1, 1), int(Label.FAR), dtype=torch.uint8)))
+        z = torch.full((1, 1), 0.1, requires_grad=True)
+        for alpha, counts in ((0.5, False), (0.5000001, True)):
+            loss, slope = gradients(supervision(z, torch.full((1, 1), alpha), pixels, CONFIG), z)
+            assert (loss > 0) == counts == bool(slope.any())
+
     def test_a_view_of_far_pixels_alone_is_supervised(self) -> None:
         labels = torch.full((2, 2), int(Label.FAR), dtype=torch.uint8)
         loader, view = loader_of(DepthPrior(torch.full((2, 2), 9.0), labels))

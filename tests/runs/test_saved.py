@@ -22,6 +22,7 @@ from d2_plugin.hooks.finite import Diverged
 from d2_plugin.locks import only_writer
 from d2_plugin.recordings.export.folder import save_recording
 from d2_plugin.recordings.synthetic.room import synthetic_recording
+from d2_plugin.runs import run as run_module
 from d2_plugin.runs.run import Run
 from d2_plugin.runs.saved import METRICS, load_checkpoint, read_metrics, save_checkpoint, watched, what_diverged
 from d2_plugin.runs.settings import RunSettings
@@ -240,3 +241,21 @@ class TestThePriorOfARun:
     def test_without_hooks_none_is_needed(self, scene: Path, tmp_path: Path) -> None:
         assert main(self.words(scene, tmp_path / "run", "--hooks", "none")) == 0
         assert read_metrics(tmp_path / "run")["prior"] is None
+
+
+def test_the_checkpoint_before_is_there_when_the_next_cannot_be_written(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = bare(scene, tmp_path / "run", iterations=6)
+    save, saved = run_module.save_checkpoint, []
+
+    def full(path: Path, state: Any) -> None:
+        if len(saved) == 3:
+            raise D2Error("cannot write")
+        saved.append(state["step"])
+        save(path, state)
+
+    monkeypatch.setattr(run_module, "save_checkpoint", full)
+    with pytest.raises(D2Error, match="cannot write"):
+        run.train()
+    assert load_checkpoint(run.folder / "checkpoint.pt", "cpu")["step"] == 3

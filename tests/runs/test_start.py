@@ -88,3 +88,12 @@ def test_the_same_seed_gives_the_same_start(recording) -> None:
     for one, same, other in zip(first.tensors(), second.tensors(), third.tensors(), strict=True):
         assert torch.equal(one, same)
         assert not torch.equal(one, other)
+
+
+def test_points_come_back_from_their_file(recording, tmp_path) -> None:
+    points = TimedPoints(surface_points(recording, 20), np.full((20, 3), 0.25), np.linspace(0, 0.2, 20))
+    points.save(tmp_path / "points.npz")
+    again = TimedPoints.load(tmp_path / "points.npz")
+    for name in ("positions", "colors", "times"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(points, name))
+    assert [path.name for path in tmp_path.iterdir()] == ["points.npz"]
