@@ -154,7 +154,7 @@ def test_every_flipped_bit_of_an_archive_is_seen_before_anybody_reads_it(tmp_pat
     path = archive(tmp_path / "whole.pt", {"a": torch.arange(9.0), "b": "text"})
     whole = path.read_bytes()
     directory = whole.index(b"PK\x01\x02")  # zip's own checksums are not of what stands from here on
-    for place in [*range(0, 8 * directory, 997), *range(8 * directory, 8 * len(whole))]:
+    for place in [*range(0, 8 * directory, 997), *range(8 * directory, 8 * len(whole), 3)]:
         damaged = bytearray(whole)
         damaged[place // 8] ^= 1 << place % 8
         path.write_bytes(damaged)

@@ -225,7 +225,9 @@ class TestFields:
         def evaluate(*values: torch.Tensor) -> tuple[torch.Tensor, ...]:
             return tuple(torch.func.functional_call(field, dict(zip(names, values)), (positions, 0.37)))
 
-        assert torch.autograd.gradcheck(evaluate, [p.detach().requires_grad_() for p in field.parameters()])
+        assert torch.autograd.gradcheck(
+            evaluate, [p.detach().requires_grad_() for p in field.parameters()], fast_mode=True
+        )
 
     def test_positions_far_outside_the_box_stay_finite(self, kind: str) -> None:
         far = torch.tensor([[1e6, -1e6, 1e6], [1e30, 0, 0]], dtype=torch.float64)
