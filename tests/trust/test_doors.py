@@ -102,6 +102,14 @@ def test_no_text_takes_long(tmp_path: Path, text: str) -> None:
     assert time.process_time() - start < 20
 
 
+def test_a_list_of_yaml_is_what_it_says(tmp_path: Path) -> None:
+    (tmp_path / "rig.yml").write_text("a: {b: 1, c: [x, y, {d: 'e'}]}\nf:\n- 1\n- g: ''\n")
+    assert Document(tmp_path / "rig.yml").content == {
+        "a": {"b": "1", "c": ["x", "y", {"d": "e"}]},
+        "f": ["1", {"g": ""}],
+    }
+
+
 @pytest.mark.parametrize("text", ["a: 1\n---\nb: 2\n", "a: 1\n? [x, y]\n: c\n", "a: &x 1\nb: *x\n"])
 def test_yaml_that_no_calibration_needs_is_refused(tmp_path: Path, text: str) -> None:
     (tmp_path / "rig.yml").write_text(text)
@@ -118,6 +126,30 @@ def test_a_sentence_that_repeats_a_damaged_file_is_short(tmp_path: Path) -> None
         read_calibration(tmp_path / "camchain.yaml")
     assert len(str(refusal.value)) < 1300
     assert str(refusal.value).endswith("calibrate it with Kalibr's pinhole-equi or pinhole-radtan")
+
+
+FLAGS = """
+--d2.views-per-evaluation 1000000000 | --densify.scale 10000000000000000000000000 | --densify.lifetime 1e300
+--densify.spacing 10000000000000000000000000 | --densify.tau-u 10000000000000000000000000
+--prune.patience 1000000000 | --depth-loss.epsilon 10000000000000000000000000 | --depth-loss.epsilon 1e-320
+--prune.tau-u 1e-320 | --priors.stereo.patchmatch-sources 2000000000 | --priors.stereo.min-sources 2000000000
+--priors.mono-threads 1000000000 | --priors.stereo.max-pixels 1000000000000
+--priors.stereo.reuse-block 1e25 | --priors.tau-c 1e300 | --priors.conflict-sigmas 1e-320
+--priors.align.epsilon 1e-320 | --priors.align.min-anchors 1e25 | --priors.depth-range 1e-320,1
+--priors.depth-range 1,1e300 | --backbone.sh-time-degree 10000000000000000000000000 | --backbone.position-rate 1e38
+--backbone.densify.budget 10000000000000000000 | --iterations 10000000000000000000 | --downscale 10000000000000000000
+--d2.prior-memory-mb 10000000000000000000 | --d2.finite-every 10000000000000000000
+"""
+
+
+def test_every_setting_has_both_bounds_on_the_command_line(recording: Path, tmp_path: Path, refused: Refused) -> None:
+    words = ["train", recording, "--train-cameras", "cam00,cam01", "--output", tmp_path / "run"]
+    for flags in FLAGS.strip().replace("\n", " | ").split(" | "):
+        name, value = flags.split()
+        said = refused(*words, name, value)
+        assert f"setting {name}" in said, said
+        assert " must be " in said, said
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_cache_that_cannot_be_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
