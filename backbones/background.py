@@ -50,7 +50,6 @@ class Background:
         degree keeps directions that no camera sees near the mean colour.
 
         Args:
-            views: the training views.
             images: the image [H, W, 3] in 0..1 of each, by its index in `views`.
         """
         if not views:

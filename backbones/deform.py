@@ -21,7 +21,7 @@ from d2_plugin.gaussians.native_slice import STATIC
 from d2_plugin.gaussians.rotation4d import rotation_matrices_3d, temporal_marginal, unit_quaternions
 from d2_plugin.gaussians.slicing import LOG_SCALE_LIMIT, MARGINAL_CUT, rows_to_draw, slice_gaussians
 from d2_plugin.rasterizer import Splats, View
-from d2_plugin.settings import Seed, Share
+from d2_plugin.settings import Seed
 
 from .deform_fields import Box, Field, HexPlaneField, HexPlaneSettings, MlpField, MlpSettings, Offsets
 from .model import SplatModel, SplatSettings, decayed_rate
@@ -46,8 +46,6 @@ class DeformSettings(SplatSettings):
 
     field: Literal["mlp", "hexplane"] = "hexplane"
     """Kind of the deformation field."""
-    warm_up: Share = 0.075
-    """Share of the run without deformation: the canonical Gaussians settle first. Official: 3000 of 40000 steps."""
     seed: Seed = 0
     """Seed of the field's start and of the noise on time; the global random state is never used."""
     mlp: MlpSettings = dataclasses.field(default_factory=MlpSettings)
@@ -71,13 +69,11 @@ class Deform(SplatModel):
         super().__init__(rows, settings, extent, duration)
         self._generator = torch.Generator().manual_seed(settings.seed)
         self.field: Field | None = None
-        self.deforms = False
         self._noise = 0.0
         if settings.temporal:
             box = Box.around(rows["positions"], extent)
             self.field = make_field(settings, box, self._generator).to(rows["positions"])
             self.field_optimizer = torch.optim.Adam(self.field.parameter_groups(), eps=1e-15, fused=True)
-            self.deforms = settings.warm_up <= 0
 
     @staticmethod
     def initial_rows(
@@ -138,8 +134,8 @@ class Deform(SplatModel):
         return moving_gaussians(self._canonical(), self.harmonics()) if self.field is None else None
 
     def offsets(self, positions: Tensor, time: float) -> Offsets | None:
-        """What the field adds at canonical `positions` [K, 3]; None where nothing is deformed (warm-up, no time)."""
-        if self.field is None or not self.deforms or not len(positions):
+        """What the field adds at canonical `positions` [K, 3]; None where nothing is deformed: without time."""
+        if self.field is None or not len(positions):
             return None
         return self.field(positions, time / self.duration)
 
@@ -149,7 +145,7 @@ class Deform(SplatModel):
 
     def regularization(self) -> Tensor | float:
         """What keeps the field smooth."""
-        return self.field.regularization() if self.field is not None and self.deforms else 0.0
+        return self.field.regularization() if self.field is not None else 0.0
 
     def optimize(self, step: int, iterations: int) -> None:
         """One step of both optimizers, gradients cleared; learning rates and noise for the next step set."""
@@ -160,7 +156,6 @@ class Deform(SplatModel):
         self.field_optimizer.zero_grad(set_to_none=True)
         for group, start in zip(self.field_optimizer.param_groups, self.field.parameter_groups()):
             group["lr"] = decayed_rate(start["lr"], start["lr"] * FIELD_DECAY, step, iterations)
-        self.deforms = step >= self.settings.warm_up * iterations
         strength = max(1 - 2 * step / max(iterations, 1), 0.0) * TIME_NOISE * self.duration
         self._noise = strength * torch.randn((), generator=self._generator).item()
 
@@ -172,7 +167,6 @@ class Deform(SplatModel):
                 "field": {name: value.clone() for name, value in self.field.state_dict().items()},
                 "field_optimizer": self.field_optimizer.state_dict(),
                 "generator": self._generator.get_state(),
-                "deforms": self.deforms,
                 "noise": self._noise,
             }
         return state
@@ -184,7 +178,7 @@ class Deform(SplatModel):
             self.field.load_state_dict(state["field"])
             self.field_optimizer.load_state_dict(state["field_optimizer"])
             self._generator.set_state(state["generator"].cpu())
-            self.deforms, self._noise = state["deforms"], state["noise"]
+            self._noise = state["noise"]
 
 
 def make_field(settings: DeformSettings, box: Box, generator: torch.Generator) -> Field:

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from d2_plugin.commands.arguments.boundary import DEBUG, guarded
 from d2_plugin.commands.arguments.form import HELP, ModuleCommand
 from d2_plugin.commands.arguments.help import entry, help_text
-from d2_plugin.errors import D2Error, unknown_name
+from d2_plugin.errors import D2Error, refuse_unknown
 
 PARTS = {
     "align": ModuleCommand("benchmarks.align", "AlignBench", "the fit of monocular to geometric depth"),
@@ -44,8 +44,7 @@ def answer(words: Sequence[str]) -> str | None:
         raise D2Error(f"no part is named: have {', '.join(PARTS)}")
     if words[0] in HELP:
         return f"usage: python -m benchmarks PART ...\n\n{parts}"
-    if words[0] not in PARTS:
-        raise unknown_name("benchmark", words[0], PARTS)
+    refuse_unknown("benchmark", [words[0]], PARTS)
     form, rest = PARTS[words[0]].form(f"python -m benchmarks {words[0]}"), words[1:]
     return help_text(form, rest) if any(word in HELP for word in rest) else form.run(form.parse(rest))
 

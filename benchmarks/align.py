@@ -13,7 +13,7 @@ import torch
 
 from benchmarks.align_measure import AlignMethod, AlignProblem, align_problem, measure, methods
 from benchmarks.rows import begin_rows
-from d2_plugin.errors import D2Error, unknown_name
+from d2_plugin.errors import D2Error, refuse_unknown
 from d2_plugin.recordings.recording import MonoKind
 from d2_plugin.runs.rows import Row, append_rows, command_line, make_row
 from d2_plugin.runs.tables import Table, markdown
@@ -66,9 +66,7 @@ def run(settings: AlignBench) -> str:
     begin_rows(settings.output)
     every = methods()
     known = dict.fromkeys(method.name for method in every)
-    for name in settings.methods:
-        if name not in known:
-            raise unknown_name("alignment method", name, known)
+    refuse_unknown("alignment method", settings.methods, known)
     chosen = [method for method in every if not settings.methods or method.name in settings.methods]
     command, rows = command_line("bench align", settings), list[Row]()
     kinds: tuple[MonoKind, ...] = get_args(MonoKind)

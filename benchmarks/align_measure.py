@@ -85,11 +85,9 @@ def align_problem(kind: MonoKind, anchors: int, outliers: float, seed: int = 0) 
     return AlignProblem(kind, mono, geometric, clean, truth)
 
 
-def weights_and_epsilon(
-    target: np.ndarray, residual: str, settings: AlignSettings | None = None
-) -> tuple[np.ndarray, float]:
-    """What `align` makes of its settings (the default ones): the weights of the residuals and the smoothing."""
-    epsilon = (settings or AlignSettings()).epsilon
+def weights_and_epsilon(target: np.ndarray, residual: str) -> tuple[np.ndarray, float]:
+    """What `align` makes of its default settings: the weights of the residuals and the smoothing."""
+    epsilon = AlignSettings().epsilon
     if residual == "relative":
         return 1 / target, epsilon
     return np.ones_like(target), epsilon * float(np.median(target))

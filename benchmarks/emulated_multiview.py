@@ -27,16 +27,14 @@ POSE_NOISE = 0.01
 
 
 def emulated_multiview(
-    depths: Sequence[np.ndarray], cameras: Sequence[Camera], seed: int, posed: bool = True, shrink: int = 2
+    depths: Sequence[np.ndarray], cameras: Sequence[Camera], seed: int, posed: bool = True
 ) -> dict[str, np.ndarray]:
-    """The arrays depth, conf [V, h, w], extrinsics [V, 3, 4] and intrinsics [V, 3, 3] of one instant.
+    """The arrays depth, conf [V, H / 2, W / 2], extrinsics [V, 3, 4] and intrinsics [V, 3, 3] of one instant.
 
     Args:
         depths: true planar z [H, W] per view, 0 in the sky; NaN where nobody knows it: there confidence is 0.
-        cameras: their calibrations.
         seed: the bends depend on it, and on nothing of the instant but its surfaces.
         posed: poses were given to the network and scale follows them; else both are its own, up to a similarity.
-        shrink: how many times smaller than the images the maps are.
     """
     draw, own = np.random.default_rng([seed, 0]), np.random.default_rng([seed, 1])
     far = max(float(np.nanmax(depth)) for depth in depths)
@@ -54,8 +52,8 @@ def emulated_multiview(
         soft = 1 / blurred(1 / solid, EDGE_BLUR * camera.width)
         wrong = np.abs(np.log(soft / solid)) + 0.5 * np.abs(bend) + 0.01 + 0.3 * sky
         trust = 1 + 0.05 / wrong * np.exp(0.3 * own.normal(size=depth.shape))
-        maps.append((soft * np.exp(bend))[shrink // 2 :: shrink, shrink // 2 :: shrink])
-        sure.append(np.where(known, trust, 0)[shrink // 2 :: shrink, shrink // 2 :: shrink])
+        maps.append((soft * np.exp(bend))[1::2, 1::2])
+        sure.append(np.where(known, trust, 0)[1::2, 1::2])
     poses = np.stack([np.asarray(camera.T_camera_world, float) for camera in cameras])
     scale = 1.0
     if not posed:

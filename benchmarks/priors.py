@@ -22,7 +22,7 @@ import torch
 from benchmarks.priors_motion import motion_errors
 from benchmarks.rows import begin_rows
 from benchmarks.stereo_rigs import ARCS
-from d2_plugin.errors import D2Error, unknown_name
+from d2_plugin.errors import D2Error, refuse_unknown
 from d2_plugin.priors.build import build_priors
 from d2_plugin.priors.declared_error import (
     NORMAL_SHARE,
@@ -120,16 +120,13 @@ def cases(settings: PriorsBench) -> list[Case]:
     rigs = settings.rigs or (() if settings.recordings else (RENDERED[-1],))
     opened = [open_recording(path) for path in settings.recordings] + [_rendered(name, settings.width) for name in rigs]
     known = {camera for recording in opened for camera in recording.cameras}
-    for camera in settings.train_cameras:
-        if camera not in known:
-            raise unknown_name("camera", camera, sorted(known))
+    refuse_unknown("camera", settings.train_cameras, known)
     return [_case(recording, settings) for recording in opened]
 
 
 def _rendered(name: str, width: int) -> Recording:
     """The room of `d2 demo`, with emulated maps, from as many cameras as the name says."""
-    if name not in RENDERED:
-        raise unknown_name("rig", name, RENDERED)
+    refuse_unknown("rig", [name], RENDERED)
     views = int(name.removeprefix("synthetic"))
     height = round(width * 9 / 16)
     room = synthetic_recording(views, 0, RENDERED_FRAMES, width, height, arc_degrees=ARCS[views])

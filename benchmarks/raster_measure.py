@@ -89,10 +89,10 @@ def splats_of(leaves: Sequence[Tensor]) -> Splats:
     return Splats(means, covariances, opacities, torch.arange(len(means), device=means.device))
 
 
-def upstream(scene: Scene, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def upstream(height: int, width: int, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Fixed random gradients of color, depth sum and alpha."""
     g = torch.Generator().manual_seed(0)
-    size = (scene.view.height, scene.view.width)
+    size = (height, width)
     color, depth, alpha = (torch.randn(shape, generator=g).to(like) for shape in ((*size, 3), size, size))
     return color, depth, alpha
 
@@ -110,7 +110,8 @@ def passes_of(render: RenderScene, scene: Scene, device: torch.device) -> dict[s
     leaves = leaves_of(scene, device, torch.float32)
     splats = splats_of(leaves)
     fixed = splats_of([leaf.detach() for leaf in leaves])
-    weights, prior = upstream(scene, leaves[0]), prior_of(scene, device)
+    weights = upstream(scene.view.height, scene.view.width, leaves[0])
+    prior = prior_of(scene, device)
 
     def forward() -> object:
         with torch.no_grad():
@@ -189,7 +190,8 @@ def error_of(render: RenderScene, scene: Scene, device: torch.device, truth: Tru
     deviations = [(part.detach().cpu().double() - true.detach()).abs() for part, true in pairs]
     apart = (deviations[0].amax(-1) > THRESHOLD_DEVIATION) | (deviations[2] > THRESHOLD_DEVIATION)
     kept = (~apart[..., None], ~apart, ~apart)
-    weights = [torch.where(keep, w.cpu(), 0) for keep, w in zip(kept, upstream(scene, scene.means))]
+    given = upstream(scene.view.height, scene.view.width, scene.means)
+    weights = [torch.where(keep, weight, 0) for keep, weight in zip(kept, given)]
     gradients = torch.autograd.grad(found[:3], leaves, [w.to(device) for w in weights])
     expected = torch.autograd.grad(truth.render[:3], truth.leaves, [w.double() for w in weights], retain_graph=True)
     errors = {

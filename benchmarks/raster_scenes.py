@@ -15,6 +15,7 @@ from torch import Tensor
 
 from d2_plugin.arrays import read_array
 from d2_plugin.errors import D2Error
+from d2_plugin.gaussians.rotation4d import rotation_matrices_3d
 from d2_plugin.rasterizer import Splats, View
 
 FOCAL = 0.85
@@ -42,16 +43,11 @@ class Scene(NamedTuple):
 
     def splats(self) -> Splats:
         """The same Gaussians with covariances."""
-        factor = rotations(self.quaternions) * self.scales[:, None, :]
+        factor = _rotations(self.quaternions) * self.scales[:, None, :]
         covariance = factor @ factor.mT
         upper = torch.triu_indices(3, 3)
         rows = torch.arange(len(self.means))
         return Splats(self.means, covariance[:, upper[0], upper[1]].contiguous(), self.opacities, rows)
-
-    def to(self, dtype: torch.dtype) -> Scene:
-        """The same scene in another floating type."""
-        means, quaternions, scales, opacities, colors = (part.to(dtype) for part in self[:5])
-        return Scene(means, quaternions, scales, opacities, colors, self.view)
 
 
 def load_scene(name: str, width: int, height: int, garden: Path | None = None) -> Scene:
@@ -70,9 +66,9 @@ def load_scene(name: str, width: int, height: int, garden: Path | None = None) -
     return synthetic_scene(int(number), width, height)
 
 
-def synthetic_scene(count: int, width: int, height: int, seed: int = 0) -> Scene:
+def synthetic_scene(count: int, width: int, height: int) -> Scene:
     """Gaussians at log-uniform depth 2..20, a tenth of them beside the view, with log-normal anisotropic scales."""
-    random = np.random.default_rng(seed)
+    random = np.random.default_rng(0)
     reference_width, reference_height = 640, 360
     focal = FOCAL * reference_width
     depth = np.exp(random.uniform(np.log(2.0), np.log(20.0), count))
@@ -85,7 +81,7 @@ def synthetic_scene(count: int, width: int, height: int, seed: int = 0) -> Scene
     opacities = np.clip(random.beta(0.8, 1.2, count), 0.005, 0.995)
     colors = random.uniform(0, 1, (count, 3))
     view = _view(np.eye(4), FOCAL * width, FOCAL * width, width, height)
-    return _scene(means, quaternions, scales, opacities, colors, view)
+    return _scene(view, means, quaternions, scales, opacities, colors)
 
 
 def garden_scene(path: Path, width: int, height: int) -> Scene:
@@ -102,23 +98,17 @@ def garden_scene(path: Path, width: int, height: int) -> Scene:
     opacities = np.clip(random.uniform(0, 1, len(means)), 0.005, 0.995)
     focal_x, focal_y = K[0, 0] * width / original_width, K[1, 1] * height / original_height
     view = _view(T_camera_world, focal_x, focal_y, width, height)
-    return _scene(means, quaternions, scales, opacities, colors, view)
+    return _scene(view, means, quaternions, scales, opacities, colors)
 
 
-def rotations(quaternions: Tensor) -> Tensor:
+def _rotations(quaternions: Tensor) -> Tensor:
     """Rotation matrices [M, 3, 3] of unit quaternions [M, 4], w first."""
-    w, x, y, z = quaternions.unbind(-1)
-    rows = [
-        *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    ]
-    return torch.stack(rows, -1).reshape(-1, 3, 3)
+    return rotation_matrices_3d(quaternions.T).permute(2, 0, 1)
 
 
 def _scale_for_radius(means: np.ndarray, quaternions: np.ndarray, scales: np.ndarray, focal: float) -> float:
     """Factor on all scales that makes the mean 3-sigma radius on the screen, blur included, `RADIUS`."""
-    factor = rotations(torch.from_numpy(quaternions)).numpy() * scales[:, None, :]
+    factor = _rotations(torch.from_numpy(quaternions)).numpy() * scales[:, None, :]
     x, y, z = means.T
     jacobian = np.zeros((len(z), 2, 3))
     jacobian[:, 0, 0] = jacobian[:, 1, 1] = focal / z
@@ -142,15 +132,7 @@ def _view(T_camera_world: np.ndarray, focal_x: float, focal_y: float, width: int
     return View("bench", 0, 0.0, torch.from_numpy(np.asarray(T_camera_world, np.float32)), K, width, height)
 
 
-def _scene(
-    means: np.ndarray,
-    quaternions: np.ndarray,
-    scales: np.ndarray,
-    opacities: np.ndarray,
-    colors: np.ndarray,
-    view: View,
-) -> Scene:
-    def tensor(values: np.ndarray) -> Tensor:
-        return torch.from_numpy(np.ascontiguousarray(values, np.float32))
-
-    return Scene(tensor(means), tensor(quaternions), tensor(scales), tensor(opacities), tensor(colors), view)
+def _scene(view: View, *parts: np.ndarray) -> Scene:
+    means, *more = (torch.from_numpy(np.ascontiguousarray(part, np.float32)) for part in parts)
+    quaternions, scales, opacities, colors = more
+    return Scene(means, quaternions, scales, opacities, colors, view)

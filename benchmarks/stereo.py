@@ -1,5 +1,5 @@
-"""`python -m benchmarks stereo`: error against run time of geometric depth, every matcher and setting behind the
-same filter."""
+"""`python -m benchmarks stereo`: error against run time of geometric depth, every setting behind the same
+filter."""
 
 from __future__ import annotations
 
@@ -12,9 +12,8 @@ from typing import Annotated, Any, Literal
 import torch
 
 from benchmarks.rows import begin_rows
-from benchmarks.stereo_measure import Method, measure, methods
+from benchmarks.stereo_measure import VARIANTS, measure
 from benchmarks.stereo_rigs import ARCS, MIDDLEBURY, load_rigs
-from d2_plugin.errors import unknown_name
 from d2_plugin.runs.rows import Row, append_rows, command_line, make_row
 from d2_plugin.runs.tables import Table, markdown
 from d2_plugin.settings import AtATime, Range, Settings
@@ -34,10 +33,8 @@ class StereoBench(Settings):
     available if not given."""
     data: Path | None = None
     """Folder with the recordings studio/ and middlebury/."""
-    makers: tuple[str, ...] = ()
-    """Matchers, of patchmatch and sgbm; all if not given."""
     defaults_only: bool = False
-    """Leave out what is varied about a matcher."""
+    """Leave out what is varied about the matcher."""
     width: Annotated[int, Range(32, unit="pixels")] = 320
     """Width of rendered images, which are 16:9, pixels."""
     repeats: Annotated[int, Range(1)] = 1
@@ -51,22 +48,23 @@ class StereoBench(Settings):
 
 
 def run(settings: StereoBench) -> str:
-    """Measure and add the rows, one per method and rig; the tables, and where the rows lie."""
+    """Measure and add the rows, one per setting and rig; the tables, and where the rows lie."""
     _set_threads(settings.threads)
     begin_rows(settings.output)
-    chosen = [
-        replace(method, settings=replace(method.settings, patchmatch_device=settings.device))
-        for method in _chosen(settings.makers, settings.defaults_only)
-    ]
+    chosen = {
+        name: replace(variant, patchmatch_device=settings.device)
+        for name, variant in VARIANTS.items()
+        if name == "default" or not settings.defaults_only
+    }
     names = settings.rigs or (*RENDERED, *(FROM_DISK if settings.data else ()))
     about = {name: getattr(settings, name) for name in ("device", "repeats")}
     about["command"] = command_line("bench stereo", settings)
     rows: list[Row] = []
     for group in [load_rigs(name, settings.data, settings.width) for name in names]:
-        for method in chosen:
-            rows.append(_row(measure(method, group, repeats=settings.repeats), **about))
+        for name, variant in chosen.items():
+            rows.append(_row(measure(name, variant, group, repeats=settings.repeats), **about))
             append_rows(settings.output, rows[-1:])
-            logger.info("%s (%s) on %s is measured", method.name, method.setting, rows[-1]["rig"])
+            logger.info("%s on %s is measured", name, rows[-1]["rig"])
     shown = [part for title, table in tables(rows) for part in (title, markdown(table))]
     return "\n\n".join([CAPTION, *shown, f"rows are in {settings.output}"])
 
@@ -79,19 +77,6 @@ def _row(found: dict[str, Any], **more: Any) -> Row:
     details = {name: value for name, value in found.items() if name not in named}
     arguments = {name: found[name] for name in named}
     return make_row("stereo", case, **arguments, error=error, seconds=seconds, **details, **more)
-
-
-def _chosen(makers: Sequence[str], defaults_only: bool) -> list[Method]:
-    every = methods()
-    known = dict.fromkeys(method.name for method in every)
-    for name in makers:
-        if name not in known:
-            raise unknown_name("stereo matcher", name, known)
-    return [
-        method
-        for method in every
-        if (not makers or method.name in makers) and (method.setting == "default" or not defaults_only)
-    ]
 
 
 CAPTION = (

@@ -1,10 +1,9 @@
-"""What is measured about geometric depth: which methods, and how good their maps are after the common filter."""
+"""What is measured about geometric depth: which settings, and how good their maps are after the common filter."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
 from statistics import median
 from typing import Any, NamedTuple
 
@@ -14,32 +13,11 @@ from benchmarks.stereo_rigs import Rig
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.settings import StereoSettings
 from d2_plugin.priors.stereo.filtering.filter import GeometricDepth, filter_depths
-from d2_plugin.priors.stereo.geometric_depth import MATCHERS, Matcher, gray
+from d2_plugin.priors.stereo.geometric_depth import gray
+from d2_plugin.priors.stereo.patchmatch import patchmatch
 
-VARIANTS: dict[str, dict[str, dict[str, Any]]] = {
-    "patchmatch": {"default": {}, "2 sources": {"patchmatch_sources": 2}},
-}
-"""What is varied about each matcher of this package: its settings that are not the default."""
-
-
-@dataclass(frozen=True)
-class Method:
-    """A matcher with one setting."""
-
-    name: str
-    setting: str
-    make: Matcher
-    settings: StereoSettings
-
-
-def methods() -> list[Method]:
-    """Every matcher that runs here and what is varied about it; the first row of each is its default."""
-    default = StereoSettings()
-    return [
-        Method(name, setting, MATCHERS[name], replace(default, **changes))
-        for name, variants in VARIANTS.items()
-        for setting, changes in variants.items()
-    ]
+VARIANTS = {"default": StereoSettings(), "2 sources": StereoSettings(patchmatch_sources=2)}
+"""What is measured of the matcher: the default first."""
 
 
 class Run(NamedTuple):
@@ -51,22 +29,22 @@ class Run(NamedTuple):
     filter_cpu: float  # seconds per view
 
 
-def run(method: Method, rig: Rig, depth_range: tuple[float, float], repeats: int = 1) -> Run:
+def run(settings: StereoSettings, rig: Rig, depth_range: tuple[float, float], repeats: int) -> Run:
     """Match and filter one rig; times are medians over `repeats`.
 
     Raises:
-        D2Error: the method cannot match this rig.
+        D2Error: this rig cannot be matched.
     """
     grays = [gray(image) for image in rig.images]
     cpu, wall = [], []
-    for _ in range(max(repeats, 1)):
+    for _ in range(repeats):
         start = time.process_time(), time.perf_counter()
-        raw = method.make(grays, rig.cameras, depth_range, method.settings)
+        raw = patchmatch(grays, rig.cameras, depth_range, settings)
         cpu.append(time.process_time() - start[0])
         wall.append(time.perf_counter() - start[1])
     start_filter = time.process_time()
     depths, costs = zip(*raw, strict=True)
-    filtered = filter_depths(grays, rig.cameras, depths, costs, method.settings)
+    filtered = filter_depths(grays, rig.cameras, depths, costs, settings)
     views = len(rig.cameras)
     return Run(filtered, median(cpu) / views, median(wall) / views, (time.process_time() - start_filter) / views)
 
@@ -102,20 +80,22 @@ def score(depths: Iterable[np.ndarray], truths: Iterable[np.ndarray | None], cov
     return Score(found / pixels, f1, float(np.median(every)), precision, float(np.mean(every > 0.05)), pixels)
 
 
-def measure(method: Method, rigs: Sequence[Rig], widen: float = 1.0, repeats: int = 1) -> dict[str, Any]:
-    """One row: scores and times of a method over the rigs of one name, or `failed` with the method's own words.
+def measure(
+    setting: str, settings: StereoSettings, rigs: Sequence[Rig], widen: float = 1.0, repeats: int = 1
+) -> dict[str, Any]:
+    """One row: scores and times over the rigs of one name, or `failed` with the matcher's own words.
 
     `widen` divides the near and multiplies the far end of the depth range.
     """
     row: dict[str, Any] = {
-        "method": method.name,
-        "setting": method.setting,
+        "method": "patchmatch",
+        "setting": setting,
         "rig": rigs[0].name,
         "views": len(rigs[0].cameras),
     }
     row |= {"width": rigs[0].cameras[0].width, "height": rigs[0].cameras[0].height, "failed": None}
     try:
-        runs = [run(method, rig, _widened(rig.depth_range, widen), repeats) for rig in rigs]
+        runs = [run(settings, rig, (rig.depth_range[0] / widen, rig.depth_range[1] * widen), repeats) for rig in rigs]
     except D2Error as error:
         return {**row, "failed": str(error)}
     found = score(
@@ -127,7 +107,3 @@ def measure(method: Method, rigs: Sequence[Rig], widen: float = 1.0, repeats: in
     pixels = rigs[0].cameras[0].width * rigs[0].cameras[0].height
     numbers = {name: None if value != value else value for name, value in found._asdict().items()}
     return {**row, **numbers, **times, "microseconds_per_pixel": times["cpu"] / pixels * 1e6}
-
-
-def _widened(depth_range: tuple[float, float], factor: float) -> tuple[float, float]:
-    return depth_range[0] / factor, depth_range[1] * factor

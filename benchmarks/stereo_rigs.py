@@ -27,6 +27,8 @@ MIDDLEBURY = ("art", "laundry", "motorcycle", "teddy")
 ARCS = {2: 10.0, 3: 50.0, 4: 30.0}
 """Degrees over which the cameras of a rendered rig are spread, per number of cameras: narrow, wide, and as in N3DV."""
 
+NOISE = 0.01
+"""Standard deviation of the sensor noise of rendered rigs, of values in 0..1."""
 OCCLUSION = 0.02
 """Two views see the same surface where its depth agrees to this share."""
 
@@ -91,8 +93,8 @@ def _nearest_surface(x: np.ndarray, y: np.ndarray, z: np.ndarray, source: Camera
     return np.where(np.isfinite(surface), surface, 0)
 
 
-def textured_rig(views: int, width: int = 320, height: int = 180, seed: int = 0, noise: float = 0.01) -> Rig:
-    """A rendered room seen by 2, 3 or 4 cameras, with sensor noise (standard deviation in 0..1) and unequal gains."""
+def textured_rig(views: int, width: int = 320, height: int = 180, seed: int = 0) -> Rig:
+    """A rendered room seen by 2, 3 or 4 cameras, with sensor noise and unequal gains."""
     if views not in ARCS:
         raise unknown_name("number of views", str(views), map(str, ARCS))
     rng = np.random.default_rng([seed, views])
@@ -107,7 +109,7 @@ def textured_rig(views: int, width: int = 320, height: int = 180, seed: int = 0,
     images = []
     for camera in cameras:
         clean = render_color(scene, camera, 0.0) * rng.uniform(0.95, 1.05)
-        images.append(np.clip(np.rint(clean + rng.normal(0, 255 * noise, clean.shape)), 0, 255).astype(np.uint8))
+        images.append(np.clip(np.rint(clean + rng.normal(0, 255 * NOISE, clean.shape)), 0, 255).astype(np.uint8))
     truths: list[np.ndarray | None] = [render_depth(scene, camera, 0.0) for camera in cameras]
     return Rig(f"synthetic{views}", images, cameras, truths)
 

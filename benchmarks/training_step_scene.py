@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from benchmarks.raster_measure import upstream
 from benchmarks.raster_scenes import FOCAL, synthetic_scene
 from d2_plugin import registry
 from d2_plugin.config import D2Config
@@ -130,9 +131,7 @@ def works_of(scene: StepScene) -> dict[str, Callable[[], object]]:
 def _rasterizer(scene: StepScene, model: Any) -> Callable[[], object]:
     """Gradients of means, covariances, opacities and colours for random ones of colour, depth sum and alpha."""
     view = scene.frames.views[len(scene.frames.views) // 2]
-    g = torch.Generator().manual_seed(0)
-    size = (scene.height, scene.width)
-    upstream = [torch.randn(shape, generator=g) for shape in ((*size, 3), size, size)]
+    weights = upstream(scene.height, scene.width, torch.zeros(0))
 
     def work() -> object:
         with torch.no_grad():
@@ -140,7 +139,7 @@ def _rasterizer(scene: StepScene, model: Any) -> Callable[[], object]:
             parts = (*splats[:3], model.colors(view, splats))
         leaves = [part.detach().requires_grad_() for part in parts]
         drawn = Splats(leaves[0], leaves[1], leaves[2], splats.rows)
-        return torch.autograd.grad(rasterize(drawn, leaves[3], view, model.settings.raster)[:3], leaves, upstream)
+        return torch.autograd.grad(rasterize(drawn, leaves[3], view, model.settings.raster)[:3], leaves, weights)
 
     return work
 

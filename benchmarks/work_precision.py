@@ -1,4 +1,4 @@
-"""Error against run time: means over cases, the Pareto front, the plot and the table under it.
+"""Error against run time: means over cases, the Pareto front, and the plot.
 
 After the work-precision diagrams of SciML and the fronts of ann-benchmarks: one series per method, one mark per
 setting, both axes logarithmic, lower left is better. What another setting beats in both is faded.
@@ -7,8 +7,7 @@ setting, both axes logarithmic, lower left is better. What another setting beats
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 from d2_plugin.runs.report.svg import Axis, Plot, Point, Series, number
@@ -18,25 +17,15 @@ SMALLEST = 1e-16
 """Errors below this are drawn here: they are rounding, and a logarithm needs a floor."""
 
 
-@dataclass(frozen=True)
-class Mean:
-    """One setting of one method over all its cases: geometric means where it worked, and where it did not."""
+class Mean(NamedTuple):
+    """One setting of one method over all its cases: geometric means where it worked, NaN where it never did."""
 
     method: str
     setting: str
-    error: float | None
-    worst: float | None
-    seconds: float | None
+    error: float
+    seconds: float
     cases: int
     failures: int
-
-
-class Drawn(NamedTuple):
-    """A mean whose error and time are both known."""
-
-    mean: Mean
-    seconds: float
-    error: float
 
 
 def means(rows: Sequence[Row]) -> list[Mean]:
@@ -44,21 +33,21 @@ def means(rows: Sequence[Row]) -> list[Mean]:
     groups: dict[tuple[str, str], list[Row]] = {}
     for row in rows:
         groups.setdefault((row["method"], row["setting"]), []).append(row)
-    return [_mean(*key, group) for key, group in groups.items()]
+    return [
+        Mean(
+            *key,
+            _geometric(row["error"] for row in group if row["error"] is not None),
+            _geometric(row["seconds"] for row in group if row["seconds"]),
+            len(group),
+            sum(bool(row["failed"]) for row in group),
+        )
+        for key, group in groups.items()
+    ]
 
 
-def _mean(method: str, setting: str, group: Sequence[Row]) -> Mean:
-    errors = [row["error"] for row in group if row["error"] is not None]
-    seconds = [row["seconds"] for row in group if row["seconds"]]
-    failures = sum(bool(row["failed"]) for row in group)
-    worst = max(errors, default=None)
-    return Mean(method, setting, _geometric(errors), worst, _geometric(seconds), len(group), failures)
-
-
-def _geometric(values: Sequence[float]) -> float | None:
-    if not values:
-        return None
-    return math.exp(sum(math.log(max(value, SMALLEST)) for value in values) / len(values))
+def _geometric(values: Iterable[float]) -> float:
+    logarithms = [math.log(max(value, SMALLEST)) for value in values]
+    return math.exp(sum(logarithms) / len(logarithms)) if logarithms else math.nan
 
 
 def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
@@ -88,31 +77,29 @@ def work_precision(
 
     A setting that failed on some case is faded and never on the front: a mean over the easy cases is no result.
     """
-    marks = [Drawn(m, m.seconds, m.error) for m in means(rows) if m.error is not None and m.seconds]
-    front = {mark.mean for mark in _front(marks)}
+    marks = [mean for mean in means(rows) if not math.isnan(mean.error + mean.seconds)]
+    front = _front(marks)
+
+    def point(mean: Mean) -> Point:
+        measured = f"{error_label} {shown(mean.error)}, {seconds_label} {shown(mean.seconds * unit)}"
+        failed = f"; failed on {mean.failures} of {mean.cases}" if mean.failures else ""
+        note = f"{mean.method}, {mean.setting}: {measured}{failed}"
+        return Point(mean.seconds * unit, mean.error, note, faded=mean not in front)
+
     series = []
     for name, color in (colors or colors_of(rows)).items():
-        mine = [mark for mark in marks if mark.mean.method == name]
-        points = tuple(_point(mark, unit, mark.mean in front, error_label, seconds_label) for mark in mine)
-        line = tuple((mark.seconds * unit, max(mark.error, SMALLEST)) for mark in _front(mine))
-        series.append(Series(name, points, line, color))
+        mine = [mark for mark in marks if mark.method == name]
+        line = tuple((mark.seconds * unit, mark.error) for mark in _front(mine))
+        series.append(Series(name, tuple(map(point, mine)), line, color))
     x = Axis.around(seconds_label, [mark.seconds * unit for mark in marks], log=True)
-    y = Axis.around(error_label, [max(mark.error, SMALLEST) for mark in marks], log=True)
+    y = Axis.around(error_label, [mark.error for mark in marks], log=True)
     return Plot(title, x, y, tuple(series))
 
 
-def _front(marks: Sequence[Drawn]) -> list[Drawn]:
+def _front(marks: Sequence[Mean]) -> list[Mean]:
     """What nothing beats in both among the settings that worked on every case, by time."""
-    whole = [mark for mark in marks if not mark.mean.failures]
+    whole = [mark for mark in marks if not mark.failures]
     return [whole[i] for i in pareto_front([(mark.seconds, mark.error) for mark in whole])]
-
-
-def _point(mark: Drawn, unit: float, on_front: bool, error_label: str, seconds_label: str) -> Point:
-    mean = mark.mean
-    measured = f"{error_label} {shown(mark.error)}, {seconds_label} {shown(mark.seconds * unit)}"
-    note = f"{mean.method}, {mean.setting}: {measured}"
-    note += f"; failed on {mean.failures} of {mean.cases}" if mean.failures else ""
-    return Point(mark.seconds * unit, max(mark.error, SMALLEST), note, faded=not on_front)
 
 
 def shown(value: float | None) -> str:

@@ -34,7 +34,6 @@ def read_array(
     """The numbers of a .npy file, or of the member `key` of an .npz file.
 
     Args:
-        path: the file.
         remedy: what to do, the end of the sentence.
         key: name of a member of an .npz; None for a .npy.
         most: bytes that the array may have.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 
 LONGEST_NAME = 100
 """Letters of an unknown name that an error repeats."""
@@ -40,3 +40,10 @@ def unknown_name(kind: str, name: str, known: Iterable[str]) -> D2Error:
     hint = f"; did you mean '{near[0]}'?" if near else ""
     asked = " ".join((name if len(name) <= LONGEST_NAME else f"{name[:LONGEST_NAME]} ...").splitlines())
     return D2Error(f"unknown {kind} '{asked}': have {', '.join(have) or 'none'}{hint}")
+
+
+def refuse_unknown(kind: str, names: Iterable[str], known: Collection[str]) -> None:
+    """Raise `unknown_name` for the first of some names that is not among `known`."""
+    for name in names:
+        if name not in known:
+            raise unknown_name(kind, name, known)

@@ -6,7 +6,7 @@ import sys
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
-from d2_plugin.errors import D2Error, unknown_name
+from d2_plugin.errors import D2Error, refuse_unknown
 from d2_plugin.reading import said
 
 BACKBONES = "d2_plugin.backbones"
@@ -24,8 +24,7 @@ def names(group: str) -> list[str]:
 def load(group: str, name: str) -> Any:
     """The registered object of that name; an unknown name is refused, with the known ones."""
     points = _points(group)
-    if name not in points:
-        raise unknown_name(group.rsplit(".", 1)[1].removesuffix("s"), name, points)
+    refuse_unknown(group.rsplit(".", 1)[1].removesuffix("s"), [name], points)
     try:
         return points[name].load()
     except D2Error:

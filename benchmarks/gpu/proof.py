@@ -22,7 +22,7 @@ import torch
 
 from benchmarks.gpu.static import ARCHITECTURES, static_analysis
 from d2_plugin.durable import make_folder
-from d2_plugin.errors import D2Error
+from d2_plugin.errors import refuse_unknown
 from d2_plugin.runs.rows import Row, append_rows, command_line, make_row
 from d2_plugin.runs.tables import Table, markdown
 from d2_plugin.settings import Range, Settings
@@ -136,7 +136,7 @@ def _profile(settings: GpuBench) -> list[str]:
 
 def _stereo(device: str) -> Callable[[GpuBench], list[str]]:
     def words(settings: GpuBench) -> list[str]:
-        kind = ("--makers", "patchmatch", "--defaults-only", "--rigs", "synthetic4", "--width", "640")
+        kind = ("--defaults-only", "--rigs", "synthetic4", "--width", "640")
         return _part("stereo", *kind, "--device", device, "--output", str(settings.output / f"stereo-{device}.jsonl"))
 
     return words
@@ -162,9 +162,7 @@ STEPS = {
 
 def run(settings: GpuBench) -> str:
     """Run the steps; a table of what each came to, and where rows and outputs lie."""
-    unknown = [name for name in settings.steps if name not in STEPS]
-    if unknown:
-        raise D2Error(f"unknown step '{unknown[0]}': have {', '.join(STEPS)}")
+    refuse_unknown("step", settings.steps, STEPS)
     make_folder(settings.output)
     command = command_line("bench gpu", settings)
     rows = list[Row]()

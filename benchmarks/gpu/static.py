@@ -44,11 +44,6 @@ PROGRAMS = (
 def static_analysis(nvcc: str, architecture: str, command: str = "") -> list[Row]:
     """One row per kernel: registers, bytes spilled, bytes of shared memory, instructions.
 
-    Args:
-        nvcc: the compiler's path.
-        architecture: e.g. ``sm_90``.
-        command: how this was started.
-
     Raises:
         D2Error: nvcc refuses a source.
     """

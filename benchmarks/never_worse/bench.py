@@ -20,7 +20,7 @@ from typing import Annotated, Literal
 from benchmarks.never_worse.maps import SPOILED, spoiled_recording
 from d2_plugin.errors import D2Error
 from d2_plugin.progress import progress_bar
-from d2_plugin.runs.ablation.presets import PRESETS, Preset
+from d2_plugin.runs.ablation.presets import PRESETS
 from d2_plugin.runs.prior.build import build_priors_for
 from d2_plugin.runs.report.quality import groups_of, scores_table
 from d2_plugin.runs.rows import Row, append_rows, command_line, read_rows
@@ -111,13 +111,30 @@ def _works(settings: NeverWorseBench, text: str) -> Iterator[Work]:
     own = _own(case, network)
     folder = settings.output.absolute() / case.slug
     shared = share(own, folder)
-    template = _Template(settings, case.name, shared)
-    yield from template.works(BACKBONE, own, PRESETS["backbone"])
-    yield from template.works(STEREO, own, PRESETS["mvs_only"])
+    methods = [(BACKBONE, own, PRESETS["backbone"]), (STEREO, own, PRESETS["mvs_only"])]
     for maps in settings.maps:
         used = _with_maps(maps, case, own, network, folder)
         if used is not None:
-            yield from template.works(maps, used, PRESETS["full"])
+            methods.append((maps, used, PRESETS["full"]))
+    command, target = command_line("bench never-worse", settings), f"{base.iterations} steps"
+    for method, given, preset in methods:
+        name = method.replace(" ", "_")
+        store = folder / "priors" / name
+        chosen = replace(given, hooks=preset.hooks, overrides=preset.merged(given.overrides), priors=str(store))
+        about = {"prior": _build(chosen, store, shared) if preset.hooks else None, "frames": given.frames}
+        for seed in settings.seeds:
+            output = folder / "runs" / name / f"{given.iterations}steps" / f"seed{seed}"
+            one = replace(chosen, seed=seed), output, shared.points
+            yield Work(*one, case.name, method, command, target, about, kind="never_worse")
+
+
+def _build(settings: RunSettings, store: Path, shared: Shared) -> str:
+    """The prior of one method, with the geometric depth of the full one; what it became, in a line."""
+    if not store.exists():
+        shutil.copytree(shared.priors, store, ignore=shutil.ignore_patterns("priors", "matches", "mono"))
+    points = TimedPoints.load(shared.points).positions
+    settings = check(settings)
+    return build_priors_for(Scene.open(settings), points, store).headline()
 
 
 def _own(case: Case, network: RunSettings) -> RunSettings:
@@ -141,31 +158,3 @@ def _with_maps(maps: Maps, case: Case, own: RunSettings, network: RunSettings, f
     shown = Path(own.recording), own.train_cameras, own.frames
     path = spoiled_recording(*shown, maps, folder / "maps" / maps, prior_settings(own))
     return replace(case.settings, recording=str(path))
-
-
-class _Template:
-    """Makes the runs of one case."""
-
-    def __init__(self, settings: NeverWorseBench, case: str, shared: Shared) -> None:
-        self.settings, self.case, self.shared = settings, case, shared
-        self.command = command_line("bench never-worse", settings)
-
-    def works(self, method: str, base: RunSettings, preset: Preset) -> Iterator[Work]:
-        """The seeds of one method, its prior built where it needs one."""
-        name = method.replace(" ", "_")
-        store = self.shared.folder / "priors" / name
-        used = replace(base, hooks=preset.hooks, overrides=preset.merged(base.overrides), priors=str(store))
-        about = {"prior": self._build(used, store) if preset.hooks else None, "frames": base.frames}
-        for seed in self.settings.seeds:
-            folder = self.shared.folder / "runs" / name / f"{base.iterations}steps" / f"seed{seed}"
-            run = replace(used, seed=seed), folder, self.shared.points
-            target = f"{base.iterations} steps"
-            yield Work(*run, self.case, method, self.command, target, about, kind="never_worse")
-
-    def _build(self, settings: RunSettings, store: Path) -> str:
-        """The prior of one method, with the geometric depth of the full one; what it became, in a line."""
-        if not store.exists():
-            shutil.copytree(self.shared.priors, store, ignore=shutil.ignore_patterns("priors", "matches", "mono"))
-        points = TimedPoints.load(self.shared.points).positions
-        settings = check(settings)
-        return build_priors_for(Scene.open(settings), points, store).headline()

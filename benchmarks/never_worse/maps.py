@@ -42,9 +42,7 @@ def spoiled_recording(
     """A copy of the recording at `path` with other maps, in `folder`; images and all else are links to it.
 
     Args:
-        path: the recording.
         cameras, frames: those that train; no other image gets a map.
-        kind: what the maps become.
         folder: where it is made; named as the recording, since rows have that name.
         prior: names the network that predicts where the recording has no maps of its own.
 
@@ -78,9 +76,7 @@ def belonging(recording: Recording, prior: PriorSettings) -> tuple[Predicted, st
     if recording.mono_kind is not None:
         return (lambda camera, frame: _present(recording.mono(camera, frame), camera, frame)), recording.mono_kind
     if prior.mono_onnx is None or prior.mono_kind is None:
-        raise D2Error(
-            f"{recording.name} has no monocular maps: give a network by --mono-onnx FILE --mono-kind relative"
-        )
+        raise D2Error(f"{recording.name} has no monocular maps: give a network")
     network = MonocularModel(prior.mono_onnx, prior.mono_kind, prior.mono_preprocessing, prior.mono_threads)
     return (lambda camera, frame: network.predict(recording.image(camera, frame))), prior.mono_kind
 

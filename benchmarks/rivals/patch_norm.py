@@ -69,7 +69,6 @@ def patch_norm_loss(depth: Tensor, target: Tensor, side: int, tolerance: float, 
 
     Args:
         depth, target: render and map [H, W], both growing with depth.
-        side: of a patch, pixels.
         tolerance: differences up to this do not count.
         whole: normalise by the deviation of the whole map (global) instead of the patch's own (local).
     """

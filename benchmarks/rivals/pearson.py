@@ -67,10 +67,8 @@ def pearson_depth_loss(depth: Tensor, inverse_depth: Tensor, span: float = 2000.
     """FSGS's loss of one view, a scalar in 0..2; 1 where nothing can be told.
 
     Args:
-        depth: rendered sum of w z [H, W].
         inverse_depth: monocular map [H, W], larger is nearer; NaN where there is none.
         span: what the map's largest value is brought to, its smallest to 0.
-        offset: added before it is inverted.
     """
     known = inverse_depth.isfinite()
     d, m = depth[known], inverse_depth[known]

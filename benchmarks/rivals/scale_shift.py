@@ -56,8 +56,6 @@ def scale_shift_loss(
     Args:
         inverse_render: x [H, W].
         inverse_depth: y [H, W].
-        mask: bool [H, W], pixels that count.
-        alpha, scales: of the gradient term.
     """
     x, y = torch.where(mask, inverse_render, 0), torch.where(mask, inverse_depth, 0)
     if not mask.any():

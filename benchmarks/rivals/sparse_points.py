@@ -51,7 +51,6 @@ def sparse_point_loss(depth: Tensor, seen: Seen, scale: float) -> Tensor:
 
     Args:
         depth: expected depth [H, W], 0 where there is none.
-        seen: the points of this view.
         scale: S, world units.
     """
     if not len(seen.depths):

@@ -19,7 +19,7 @@ from benchmarks.stability.definition import Sweep
 from benchmarks.stability.gaussians import gaussian_sweeps
 from benchmarks.stability.priors import prior_sweeps
 from benchmarks.work_precision import shown
-from d2_plugin.errors import D2Error, unknown_name
+from d2_plugin.errors import D2Error, refuse_unknown
 from d2_plugin.progress import progress_bar
 from d2_plugin.runs.rows import Row, append_rows, command_line, make_row
 from d2_plugin.runs.tables import Table, markdown
@@ -81,9 +81,7 @@ def run_sweeps(names: Sequence[str] = (), command: str = "") -> list[Row]:
     Raises:
         D2Error: there is no such sweep.
     """
-    for name in names:
-        if name not in SWEEPS:
-            raise unknown_name("sweep", name, SWEEPS)
+    refuse_unknown("sweep", names, SWEEPS)
     points = [
         (sweep, value, precision)
         for name, sweep in SWEEPS.items()

@@ -18,7 +18,7 @@ from benchmarks.trainers.prepare import Source, prepare
 from benchmarks.trainers.trial_run import METHODS, Row, trial_row
 from benchmarks.trainers.trials import TRIALS
 from d2_plugin.durable import append
-from d2_plugin.errors import D2Error, unknown_name
+from d2_plugin.errors import D2Error, refuse_unknown
 from d2_plugin.reading import json_text, read_text
 from d2_plugin.runs.rows import circumstances, command_line
 from d2_plugin.settings import Positional, Range, Seed, Settings
@@ -56,12 +56,8 @@ class TrainersBench(Settings):
 
 def run(settings: TrainersBench) -> str:
     """Run what is there, add the rows, and make the tables."""
-    for name in settings.only:
-        if name not in TRIALS:
-            raise unknown_name("repository", name, TRIALS)
-    for name in settings.methods:
-        if name not in METHODS:
-            raise unknown_name("method", name, METHODS)
+    refuse_unknown("repository", settings.only, TRIALS)
+    refuse_unknown("method", settings.methods, METHODS)
     absent = []
     for name in settings.only or TRIALS:
         if settings.checkouts is None:

@@ -63,18 +63,16 @@ def free_port() -> str:
 Scores = Callable[[Job, str], dict[int, float]]
 """From a finished job and what it printed: PSNR in dB by iteration."""
 
-_REPORT = re.compile(r"\[ITER (\d+)\] Evaluating test: L1 \S+ PSNR ([\d.]+)")
-_SCORED = re.compile(r"\[held out\] iteration (\d+): PSNR ([\d.]+)")
+
+def _found(line: str) -> Scores:
+    # The last of equal iterations counts.
+    return lambda job, printed: {int(number): float(psnr) for number, psnr in re.findall(line, printed)}
 
 
-def reported(job: Job, printed: str) -> dict[int, float]:
-    """The trainer's own `Evaluating test` lines."""
-    return {int(number): float(psnr) for number, psnr in _REPORT.findall(printed)}
-
-
-def scored_after(job: Job, printed: str) -> dict[int, float]:
-    """What `inside` printed once the script had ended; the last of equal iterations counts."""
-    return {int(number): float(psnr) for number, psnr in _SCORED.findall(printed)}
+reported = _found(r"\[ITER (\d+)\] Evaluating test: L1 \S+ PSNR ([\d.]+)")
+"""The trainer's own `Evaluating test` lines."""
+scored_after = _found(r"\[held out\] iteration (\d+): PSNR ([\d.]+)")
+"""What `inside` printed once the script had ended."""
 
 
 def gsplat_stats(job: Job, printed: str) -> dict[int, float]:

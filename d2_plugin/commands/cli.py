@@ -12,7 +12,7 @@ from d2_plugin import __version__
 from d2_plugin.commands.arguments.boundary import DEBUG, guarded
 from d2_plugin.commands.arguments.form import HELP, ModuleCommand
 from d2_plugin.commands.arguments.help import entry, help_text
-from d2_plugin.errors import D2Error, unknown_name
+from d2_plugin.errors import D2Error, refuse_unknown
 
 COMMANDS: dict[str, str | ModuleCommand] = {
     "demo": ModuleCommand(
@@ -86,8 +86,7 @@ def _answer(words: list[str]) -> str | None:
         raise D2Error(f"no command is given: have {', '.join(COMMANDS)}; `d2 --help` says what each does")
     if words[0] in HELP:
         return _overview()
-    if words[0] not in COMMANDS:
-        raise unknown_name("command", words[0], COMMANDS)
+    refuse_unknown("command", [words[0]], COMMANDS)
     rest = words[1:]
     command = COMMANDS[words[0]]
     form = command.form(f"d2 {words[0]}") if isinstance(command, ModuleCommand) else _module(command).form(rest)

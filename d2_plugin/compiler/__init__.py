@@ -25,16 +25,15 @@ import subprocess
 import tempfile
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from d2_plugin.cache import cache_folder, cache_lock, check_private, is_trusted, private_cache
 from d2_plugin.compiler.prebuilt import find as find_prebuilt
 from d2_plugin.durable import write_text
 from d2_plugin.errors import D2Error
 
-__all__ = ["CompileError", "NoCompiler", "cache_folder", "find_compiler", "load_kernel", "load_library"]
+__all__ = ["CompileError", "NoCompiler", "cache_folder", "find_compiler", "load_library"]
 
 logger = logging.getLogger(__name__)
 
@@ -96,9 +95,7 @@ def load_library(
 
     Args:
         name: what the library is called in the cache and in messages, e.g. ``"rasterizer"``.
-        sources: C++ files, compiled together.
         headers: files the sources include; a change in them compiles anew, their folders are searched for includes.
-        flags: added to `BASE_FLAGS`.
 
     Raises:
         NoCompiler: there is no C++17 compiler.
@@ -117,36 +114,6 @@ def load_library(
             check_private(library.parent)
             _loaded[library] = _open(library) or _build(library, command, sources)
         return _loaded[library]
-
-
-def load_kernel(
-    name: str,
-    source: Path,
-    headers: Sequence[Path],
-    flags: Sequence[str],
-    call: type[ctypes.Structure],
-    results: Mapping[str, Any],
-) -> ctypes.CDLL | None:
-    """A kernel with a torch fallback; None without a compiler, of which the rasterizer has warned already.
-
-    Args:
-        name, source, headers, flags: see `load_library`.
-        call: what each function is given a pointer to; `d2_NAME_size` of the source returns its size.
-        results: what each function returns, by its name.
-
-    Raises:
-        CompileError: see `load_library`.
-    """
-    try:
-        kernel = load_library(name, (source,), headers, flags)
-    except NoCompiler:
-        return None
-    for function, result in results.items():
-        getattr(kernel, function).argtypes, getattr(kernel, function).restype = (ctypes.POINTER(call),), result
-    size = getattr(kernel, f"d2_{name}_size")
-    size.restype = ctypes.c_int64
-    assert size() == ctypes.sizeof(call), f"the call differs between {source.name} and its module in Python"
-    return kernel
 
 
 def _opened(library: Path) -> ctypes.CDLL:

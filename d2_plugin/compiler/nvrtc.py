@@ -136,10 +136,7 @@ def build(name: str, code: Program, flags: Sequence[str], capability: int) -> Bi
     """A program for GPUs of compute capability `capability` (90 is sm_90), from the cache where it is there already.
 
     Args:
-        name: what it is called in the cache.
-        code: what is compiled.
         flags: of NVRTC, without the architecture.
-        capability: of the GPU.
 
     Raises:
         NoCuda: no NVRTC, or it does not know the GPU.

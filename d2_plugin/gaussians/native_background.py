@@ -6,7 +6,6 @@ In torch it is a fifth of a training step of 50,000 Gaussians at 640x360. Compil
 
 from __future__ import annotations
 
-import ctypes
 import functools
 from typing import Any
 
@@ -14,29 +13,22 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from d2_plugin.compiler import load_kernel
+from d2_plugin.compiler.kernels import load_kernel, structure
 from d2_plugin.gaussians.native_slice import FLAGS, KERNELS, SHARED_HEADERS
 
-
-class _Call(ctypes.Structure):
-    """d2::Background of kernels/background.cpp: an image and the nodes of its background."""
-
-    _fields_ = (
-        *((name, ctypes.c_int32) for name in ("height", "width", "rows", "columns", "stride", "terms", "threads")),
-        *((name, ctypes.c_void_p) for name in ("basis", "constant", "harmonics", "color", "alpha", "out")),
-        *((name, ctypes.c_void_p) for name in ("grad_out", "grad_alpha", "grad_constant", "grad_harmonics")),
-    )
+_Call = structure(
+    "int height width rows columns stride terms threads",
+    "pointer basis constant harmonics color alpha out grad_out grad_alpha grad_constant grad_harmonics",
+)
+"""d2::Background of kernels/background.cpp: an image and the nodes of its background."""
 
 
 @functools.cache
-def library() -> ctypes.CDLL | None:
-    """The compiled kernel; None without a compiler.
-
-    Raises:
-        CompileError: see `d2_plugin.compiler.load_kernel`.
-    """
+def library() -> Any:
+    """The compiled kernel; None without a compiler."""
     results = {"d2_background": None, "d2_background_backward": None}
-    return load_kernel("background", KERNELS / "background.cpp", SHARED_HEADERS, FLAGS, _Call, results)
+    sources = (KERNELS / "background.cpp",)
+    return load_kernel("background", sources, SHARED_HEADERS, FLAGS, {"background": _Call}, results, optional=True)
 
 
 def can_composite(*parts: Tensor) -> bool:
@@ -65,8 +57,8 @@ class _Composite(torch.autograd.Function):
         *tensors, nodes = inputs
         color, *parts = (part.contiguous() for part in tensors)
         out, call = torch.empty_like(color), _call(parts, nodes)
-        call.color, call.out = color.data_ptr(), out.data_ptr()
-        _kernel().d2_background(call)
+        call.point(color=color, out=out)
+        library().d2_background(call)
         ctx.save_for_backward(*parts)
         ctx.nodes = nodes
         return out
@@ -77,21 +69,13 @@ class _Composite(torch.autograd.Function):
         alpha, basis, constant, harmonics = ctx.saved_tensors
         gradient, call = gradient.contiguous(), _call((alpha, basis, constant, harmonics), ctx.nodes)
         by_alpha, by_constant, by_harmonics = (torch.empty_like(part) for part in (alpha, constant, harmonics))
-        call.grad_out, call.grad_alpha = gradient.data_ptr(), by_alpha.data_ptr()
-        call.grad_constant, call.grad_harmonics = by_constant.data_ptr(), by_harmonics.data_ptr()
-        _kernel().d2_background_backward(call)
+        call.point(grad_out=gradient, grad_alpha=by_alpha, grad_constant=by_constant, grad_harmonics=by_harmonics)
+        library().d2_background_backward(call)
         return gradient, by_alpha, None, by_constant, by_harmonics, None
 
 
-def _kernel() -> ctypes.CDLL:
-    kernel = library()
-    assert kernel is not None, "composite_background is for where can_composite is True"
-    return kernel
-
-
-def _call(parts: Any, nodes: tuple[int, int, int]) -> _Call:
+def _call(parts: Any, nodes: tuple[int, int, int]) -> Any:
     alpha, basis, constant, harmonics = parts
     call = _Call(*alpha.shape, *nodes, basis.shape[1], torch.get_num_threads())
-    call.alpha, call.basis = alpha.data_ptr(), basis.data_ptr()
-    call.constant, call.harmonics = constant.data_ptr(), harmonics.data_ptr()
+    call.point(alpha=alpha, basis=basis, constant=constant, harmonics=harmonics)
     return call

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from d2_plugin.compiler import load_kernel
+from d2_plugin.compiler.kernels import load_kernel, structure
 from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.rotation4d import SMALL_NORM
 
@@ -31,39 +31,22 @@ STATIC = {"positions": 3, "log_scales": 3, "left": 4, "opacity_logits": 1}
 TEMPORAL = {**STATIC, "times": 1, "log_time_scales": 1, "right": 4}
 
 
-class _Call(ctypes.Structure):
-    """d2::Slice of kernels/slice4d.cpp: what one call works on; absent pointers stay null."""
-
-    _fields_ = (
-        *((name, ctypes.c_int64) for name in ("count", "drawn")),
-        *((name, ctypes.c_float) for name in ("time", "marginal_cut", "log_scale_limit", "small_norm")),
-        ("threads", ctypes.c_int32),
-        *((name, ctypes.c_void_p) for name in (*TEMPORAL, "rows", "means", "covariances", "opacities")),
-        *((f"grad_{name}", ctypes.c_void_p) for name in ("means", "covariances", "opacities", *TEMPORAL)),
-    )
-
-    def point(self, **tensors: Tensor | None) -> None:
-        """Set pointers by name; the caller keeps the tensors alive."""
-        for name, tensor in tensors.items():
-            if tensor is not None:
-                setattr(self, name, tensor.data_ptr())
+_Call = structure(
+    "long count drawn",
+    "float time marginal_cut log_scale_limit small_norm",
+    "int threads",
+    f"pointer {' '.join(TEMPORAL)} rows means covariances opacities",
+    f"pointer grad_means grad_covariances grad_opacities {' '.join(f'grad_{name}' for name in TEMPORAL)}",
+)
+"""d2::Slice of kernels/slice4d.cpp: what one call works on."""
 
 
 @functools.cache
-def library() -> ctypes.CDLL | None:
-    """The compiled kernel; None without a compiler.
-
-    Raises:
-        CompileError: see `d2_plugin.compiler.load_kernel`.
-    """
+def library() -> Any:
+    """The compiled kernel; None without a compiler."""
     results = {"d2_slice_rows": ctypes.c_int64, "d2_slice_forward": None, "d2_slice_backward": None}
-    return load_kernel("slice4d", KERNELS / "slice4d.cpp", SHARED_HEADERS, FLAGS, _Call, results)
-
-
-def _kernel() -> ctypes.CDLL:
-    kernel = library()
-    assert kernel is not None, "native_slice is for where can_slice is True"
-    return kernel
+    sources = (KERNELS / "slice4d.cpp",)
+    return load_kernel("slice4d", sources, SHARED_HEADERS, FLAGS, {"slice4d": _Call}, results, optional=True)
 
 
 def can_slice(raw: Mapping[str, Tensor]) -> bool:
@@ -108,7 +91,7 @@ class _Slice(torch.autograd.Function):
         count = call.drawn
         outputs = raw[0].new_empty(count, 3), raw[0].new_empty(count, 6), raw[0].new_empty(count)
         call.point(means=outputs[0], covariances=outputs[1], opacities=outputs[2])
-        _kernel().d2_slice_forward(call)
+        library().d2_slice_forward(call)
         ctx.constants = (time, cut, limit)
         ctx.save_for_backward(rows, *raw)
         ctx.set_materialize_grads(False)
@@ -127,11 +110,11 @@ class _Slice(torch.autograd.Function):
         call.point(grad_means=incoming[0], grad_covariances=incoming[1], grad_opacities=incoming[2])
         gradients = [torch.empty_like(tensor) for tensor in raw]
         call.point(**{f"grad_{name}": gradient for name, gradient in zip(TEMPORAL, gradients)})
-        _kernel().d2_slice_backward(call)
+        library().d2_slice_backward(call)
         return None, None, None, *gradients
 
 
-def _prepare(constants: tuple[float, float, float], raw: tuple[Tensor, ...]) -> _Call:
+def _prepare(constants: tuple[float, float, float], raw: tuple[Tensor, ...]) -> Any:
     time, cut, limit = constants
     call = _Call(time=time, marginal_cut=cut, log_scale_limit=limit, small_norm=SMALL_NORM)
     call.count, call.threads = raw[0].shape[0], torch.get_num_threads()
@@ -139,12 +122,12 @@ def _prepare(constants: tuple[float, float, float], raw: tuple[Tensor, ...]) -> 
     return call
 
 
-def _rows(call: _Call) -> Tensor:
+def _rows(call: Any) -> Tensor:
     """The Gaussians that are drawn, int64 [M]; sets `call.drawn` to M."""
     if not call.times:
         call.drawn = call.count
         return torch.arange(call.count)
     rows = torch.empty(call.count, dtype=torch.int64)
     call.point(rows=rows)
-    call.drawn = _kernel().d2_slice_rows(call)
+    call.drawn = library().d2_slice_rows(call)
     return rows[: call.drawn]

@@ -13,36 +13,22 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from d2_plugin.compiler import load_kernel
+from d2_plugin.compiler.kernels import load_kernel, structure
 from d2_plugin.gaussians.native_slice import FLAGS, KERNELS, SHARED_HEADERS
 
-
-class _Call(ctypes.Structure):
-    """d2::Photometric of kernels/ssim.cpp; a null gradient is not computed."""
-
-    _fields_ = (
-        *((name, ctypes.c_int32) for name in ("height", "width", "channels", "threads")),
-        ("ssim_weight", ctypes.c_float),
-        ("window", ctypes.c_float * 11),
-        *((name, ctypes.c_void_p) for name in ("image", "target", "bytes", "gradient", "differences", "similarities")),
-    )
+_Call = structure(
+    "int height width channels threads",
+    "float ssim_weight window[11]",
+    "pointer image target bytes gradient differences similarities",
+)
+"""d2::Photometric of kernels/ssim.cpp; a null gradient is not computed."""
 
 
 @functools.cache
-def library() -> ctypes.CDLL | None:
-    """The compiled kernel; None without a compiler.
-
-    Raises:
-        CompileError: see `d2_plugin.compiler.load_kernel`.
-    """
+def library() -> Any:
+    """The compiled kernel; None without a compiler."""
     results = {"d2_photometric": ctypes.c_double}
-    return load_kernel("ssim", KERNELS / "ssim.cpp", SHARED_HEADERS, FLAGS, _Call, results)
-
-
-def _kernel() -> ctypes.CDLL:
-    kernel = library()
-    assert kernel is not None, "native_photometric_loss is for where can_compare is True"
-    return kernel
+    return load_kernel("ssim", (KERNELS / "ssim.cpp",), SHARED_HEADERS, FLAGS, {"ssim": _Call}, results, optional=True)
 
 
 def can_compare(image: Tensor, target: Tensor) -> bool:
@@ -72,11 +58,9 @@ class _Photometric(torch.autograd.Function):
         gradient = torch.empty_like(image) if ctx.needs_input_grad[0] else None
         sums = torch.empty(2, height, dtype=torch.float64)
         call = _Call(height, width, channels, torch.get_num_threads(), ssim_weight, (ctypes.c_float * 11)(*window))
-        call.image = image.data_ptr()
-        setattr(call, "bytes" if target.dtype == torch.uint8 else "target", target.data_ptr())
-        call.gradient = None if gradient is None else gradient.data_ptr()
-        call.differences, call.similarities = sums[0].data_ptr(), sums[1].data_ptr()
-        loss = _kernel().d2_photometric(call)
+        call.point(image=image, gradient=gradient, differences=sums[0], similarities=sums[1])
+        call.point(**{"bytes" if target.dtype == torch.uint8 else "target": target})
+        loss = library().d2_photometric(call)
         ctx.save_for_backward(gradient)
         return image.new_full((), loss)
 

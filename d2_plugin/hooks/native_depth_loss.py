@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from d2_plugin.compiler import load_kernel
+from d2_plugin.compiler.kernels import load_kernel
 from d2_plugin.hooks.prior import KnownMaps
 from d2_plugin.rasterizer.native import KERNELS as RASTERIZER_KERNELS
 
@@ -42,9 +42,10 @@ def library() -> ctypes.CDLL | None:
     """The compiled kernel; None without a compiler.
 
     Raises:
-        CompileError: see `d2_plugin.compiler.load_kernel`.
+        CompileError: see `d2_plugin.compiler.kernels.load_kernel`.
     """
-    return load_kernel("depth_loss", SOURCE, HEADERS, FLAGS, _Call, {"d2_depth_loss": ctypes.c_double})
+    results = {"d2_depth_loss": ctypes.c_double}
+    return load_kernel("depth_loss", (SOURCE,), HEADERS, FLAGS, {"depth_loss": _Call}, results, optional=True)
 
 
 def can_compare(depth_sum: Tensor, alpha: Tensor, known: KnownMaps) -> bool:

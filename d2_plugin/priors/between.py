@@ -28,6 +28,7 @@ from d2_plugin.priors.scene_flow import (
 )
 from d2_plugin.protocol import CameraRecord, DepthPrior, Label
 from d2_plugin.recordings.images import opencv
+from d2_plugin.recordings.selection import spread
 from d2_plugin.store.files import hash_of
 from d2_plugin.store.maps import FusedPrior, empty_prior
 from d2_plugin.store.store import QUARTERS, PriorStore
@@ -93,8 +94,7 @@ class CameraMotion:
         record = store.camera(name, store.frames[0])
         assert record is not None, "a prior of this version describes its camera"
         self.camera = record
-        chosen = np.unique(np.linspace(0, len(store.frames) - 1, STILL_INSTANTS).round().astype(int))
-        self.still = still_image([self._image(store.frames[index]) for index in chosen])
+        self.still = still_image([self._image(frame) for frame in spread(store.frames, STILL_INSTANTS)])
         self.regions: list[list[Region]] = []
         for first, second in zip(store.frames, store.frames[1:]):
             images = self._image(first), self._image(second)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from d2_plugin.compiler import NoCompiler
-from d2_plugin.errors import D2Error, unknown_name
+from d2_plugin.errors import D2Error, refuse_unknown
 from d2_plugin.priors.construct import CONSTRUCTION_VERSION, ViewSources, compares_cameras, construct
 from d2_plugin.priors.cross_view import kernel as cross_view
 from d2_plugin.priors.depth_on_disk import DepthOnDisk, find_depth_on_disk
@@ -331,8 +331,6 @@ def _shard(frames: Sequence[int], settings: PriorSettings, shard: tuple[int, int
 def _check(recording: Recording, names: list[str]) -> None:
     if not names:
         raise D2Error("no camera was chosen for the priors: name at least one")
-    for name in names:
-        if name not in recording.cameras:
-            raise unknown_name("camera", name, recording.cameras)
+    refuse_unknown("camera", names, recording.cameras)
     if len(set(names)) < len(names):
         raise D2Error(f"a camera is named twice in {', '.join(names)}: name each once")

@@ -14,6 +14,7 @@ import numpy as np
 
 from d2_plugin.protocol import Label
 from d2_plugin.recordings.recording import Recording
+from d2_plugin.recordings.selection import spread
 from d2_plugin.store.store import PriorStore
 
 DECLARED = (Label.VERIFIED, Label.AGREED, Label.MONO)
@@ -90,9 +91,7 @@ class DeclaredErrors:
 def frames_with_truth(recording: Recording, cameras: Sequence[str], most: int | None = None) -> list[int]:
     """The frames at which one of these cameras at least has a true depth map; `most` of them, spread, where given."""
     frames = [f for f in recording.frames if any(recording.depth(camera, f) is not None for camera in cameras)]
-    if most is None or len(frames) <= most:
-        return frames
-    return [frames[place] for place in np.linspace(0, len(frames) - 1, most).round().astype(int)]
+    return frames if most is None or len(frames) <= most else spread(frames, most)
 
 
 def held_against_truth(

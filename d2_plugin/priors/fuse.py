@@ -6,7 +6,7 @@ from typing import get_args
 
 import numpy as np
 
-from d2_plugin.errors import D2Error, unknown_name
+from d2_plugin.errors import D2Error, refuse_unknown
 from d2_plugin.priors.settings import Variant
 from d2_plugin.protocol import Label
 from d2_plugin.recordings.images import opencv
@@ -92,8 +92,7 @@ def fuse(
     Raises:
         D2Error: maps of two sizes, or an unknown variant.
     """
-    if variant not in VARIANTS:
-        raise unknown_name("prior variant", variant, VARIANTS)
+    refuse_unknown("prior variant", [variant], VARIANTS)
     if mono.shape != geometric.shape:
         raise D2Error(f"monocular depth is {mono.shape}, geometric depth {geometric.shape}: bring both to one size")
     alone = mono if hanging is None else np.where(hanging, np.float32(0), mono)

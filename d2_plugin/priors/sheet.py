@@ -12,6 +12,7 @@ from d2_plugin.errors import D2Error
 from d2_plugin.protocol import DepthPrior, Label
 from d2_plugin.recordings.images import opencv, write_png
 from d2_plugin.recordings.recording import Recording
+from d2_plugin.recordings.selection import spread
 from d2_plugin.store.store import PriorStore
 
 LABEL_COLORS = {
@@ -62,7 +63,7 @@ def contact_sheet(
     """
     cv2 = opencv("the contact sheet")
     shared = [frame for frame in store.frames if frame in recording.frames]
-    chosen = _spread(shared, 3) if frames is None else list(frames)
+    chosen = spread(shared, 3) if frames is None else list(frames)
     rows = [
         _row(cv2, recording.image(camera, frame), prior, _caption(store, camera, frame), width)
         for frame in chosen
@@ -154,8 +155,3 @@ def _caption(store: PriorStore, camera: str, frame: int) -> str:
         source += f", refused: {alignment['reason']}"
     refused = f"; map refused: {record['refused']}" if record["refused"] else ""
     return f"camera {camera}, frame {frame}: {shares}{refused or source}"
-
-
-def _spread(frames: Sequence[int], count: int) -> list[int]:
-    picked = np.unique(np.linspace(0, len(frames) - 1, count).round().astype(int))
-    return [frames[index] for index in picked]

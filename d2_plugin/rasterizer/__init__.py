@@ -80,8 +80,6 @@ def survey(
     two cameras agree on) and 0 elsewhere. Far pixels never count, nor do those whose depth is not finite and positive.
 
     Args:
-        splats: M Gaussians in the world.
-        view: camera.
         prior: D*, its labels and its reliability, of the view's size.
         settings: constants; the same as in `rasterize` give the same weights.
         eps: epsilon of |z - D*| / (D* + eps), in units of depth.

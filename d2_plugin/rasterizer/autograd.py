@@ -62,13 +62,13 @@ def survey(
     kernels = _kernels(means)
     camera = (view.T_camera_world, view.K, view.width, view.height)
     frame = kernels.frame_of(means, covariances, opacities, *camera, constants_of(settings), 0)
-    frame.point(prior_depth=depth, reliability=counted, near_edge=edge).eps = eps
+    frame.pointing(prior_depth=depth, reliability=counted, near_edge=edge).eps = eps
     kernels.project(frame, means, view.K)
     weight, error, max_weight, front = (torch.empty_like(opacities) for _ in range(4))
     hits = torch.empty_like(opacities, dtype=torch.int32)
     depth_sum, alpha = (opacities.new_empty(view.height, view.width) for _ in range(2))
-    frame.point(depth_sum=depth_sum, alpha=alpha, hits=hits)
-    kernels.gather(frame.point(weight=weight, error=error, max_weight=max_weight, front_weight=front), means.device)
+    frame.pointing(depth_sum=depth_sum, alpha=alpha, hits=hits)
+    kernels.gather(frame.pointing(weight=weight, error=error, max_weight=max_weight, front_weight=front), means.device)
     return Survey(weight, error, max_weight, hits, depth_sum, alpha, front)
 
 
@@ -101,7 +101,7 @@ class _Rasterize(torch.autograd.Function):
         color = means.new_empty(height, width, colors.shape[1])
         depth_sum, alpha = (means.new_empty(height, width) for _ in range(2))
         front = means.new_empty((0,) if near_edge is None else (height, width))
-        kernels.render(frame.point(color=color, depth_sum=depth_sum, alpha=alpha, front=front), means.device)
+        kernels.render(frame.pointing(color=color, depth_sum=depth_sum, alpha=alpha, front=front), means.device)
         ctx.save_for_backward(*tensors, color, depth_sum, alpha, front, records, lists)
         ctx.set_materialize_grads(False)
         return color, depth_sum, alpha, front
@@ -115,14 +115,14 @@ class _Rasterize(torch.autograd.Function):
         )
         means, covariances, opacities, colors = inputs[:4]
         kernels, frame = _frame(inputs, color.shape[1], color.shape[0], ctx.constants)
-        frame.point(color=color, depth_sum=depth_sum, alpha=alpha, front=front, records=records)
+        frame.pointing(color=color, depth_sum=depth_sum, alpha=alpha, front=front, records=records)
         kernels.point_lists(frame, lists)
         upstream = [None if gradient is None else gradient.contiguous() for gradient in gradients]
-        frame.point(**dict(zip(("grad_color", "grad_depth_sum", "grad_alpha", "grad_front"), upstream)))
+        frame.pointing(**dict(zip(("grad_color", "grad_depth_sum", "grad_alpha", "grad_front"), upstream)))
         computed: list[Tensor | None] = [torch.empty_like(part) for part in (means, covariances, opacities, colors)]
         on_screen = means.new_empty(len(means), 2)
         names = ("grad_means", "grad_covariances", "grad_opacities", "grad_colors")
-        frame.point(**dict(zip(names, computed)), grad_screen_offsets=on_screen)
+        frame.pointing(**dict(zip(names, computed)), grad_screen_offsets=on_screen)
         kernels.backward(frame, means.device)
         on_background = None
         if ctx.needs_input_grad[4] and upstream[0] is not None:
@@ -136,6 +136,6 @@ def _frame(inputs: Sequence[Tensor], width: int, height: int, constants: list[fl
     means, covariances, opacities, colors, background, screen_offsets, *camera, near_edge = inputs
     kernels = _kernels(means)
     frame = kernels.frame_of(means, covariances, opacities, *camera, width, height, constants, colors.shape[1])
-    return kernels, frame.point(
+    return kernels, frame.pointing(
         colors=colors, background=background, screen_offsets=screen_offsets, near_edge=near_edge
     )

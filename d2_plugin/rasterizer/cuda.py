@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 
 from d2_plugin.compiler.driver import Driver
+from d2_plugin.compiler.kernels import fields
 from d2_plugin.compiler.nvrtc import Binary, NoCuda, Program, build
 from d2_plugin.errors import D2Error
 from d2_plugin.rasterizer.native import KERNELS, RECORD, PointingFrame
@@ -39,32 +40,21 @@ MOST_PAIRS = 2**31 - 1
 THREADS, TILE, GATHERERS, WARP, MOMENTS, STATISTICS = 256, 16, 8, 32, 7, 4
 """As in gpu.cu: threads of a block, pixels along a side of a tile, and the sizes of what is gathered."""
 
-_float, _int, _long, _pointer = ctypes.c_float, ctypes.c_int32, ctypes.c_int64, ctypes.c_void_p
-
 
 class Frame(PointingFrame):
-    """d2::Frame of kernels/gpu.cu: everything that one call works on; absent pointers stay null."""
+    """d2::Frame of kernels/gpu.cu: everything that one call works on."""
 
-    _fields_ = (
-        ("constants", _float * 7),
-        *((name, _int) for name in ("width", "height", "channels", "tiles_x")),
-        ("eps", _float),
-        *((name, _long) for name in ("count", "pairs")),
-        *(
-            (name, _pointer)
-            for name in (
-                *("T_camera_world", "K"),
-                *("means", "covariances", "opacities", "colors", "screen_offsets", "background"),
-                *("prior_depth", "reliability", "near_edge"),
-                *("records", "tile_counts", "depths", "by_depth", "slot_ends"),
-                *("slot_tiles", "slot_ids", "ids", "slots", "tile_starts"),
-                *("color", "depth_sum", "alpha", "front"),
-                *("grad_color", "grad_depth_sum", "grad_alpha", "grad_front"),
-                *("values", "moments"),
-                *("grad_means", "grad_covariances", "grad_opacities", "grad_colors", "grad_screen_offsets"),
-                *("weight", "error", "max_weight", "front_weight", "hits"),
-            )
-        ),
+    _fields_ = fields(
+        "float constants[7]",
+        "int width height channels tiles_x",
+        "float eps",
+        "long count pairs",
+        "pointer T_camera_world K means covariances opacities colors screen_offsets background",
+        "pointer prior_depth reliability near_edge records tile_counts depths by_depth slot_ends",
+        "pointer slot_tiles slot_ids ids slots tile_starts color depth_sum alpha front",
+        "pointer grad_color grad_depth_sum grad_alpha grad_front values moments",
+        "pointer grad_means grad_covariances grad_opacities grad_colors grad_screen_offsets",
+        "pointer weight error max_weight front_weight hits",
     )
 
     @property
@@ -151,8 +141,8 @@ def frame_of(
     frame = Frame(width=width, height=height, channels=channels, tiles_x=-(-width // TILE), count=len(means))
     frame.constants[:] = constants
     camera = (part.to(means, non_blocking=True).contiguous() for part in (T_camera_world, K))
-    frame.point(**dict(zip(("T_camera_world", "K"), camera)))
-    return frame.point(means=means, covariances=covariances, opacities=opacities)
+    frame.pointing(**dict(zip(("T_camera_world", "K"), camera)))
+    return frame.pointing(means=means, covariances=covariances, opacities=opacities)
 
 
 def project(frame: Frame, means: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
@@ -164,7 +154,7 @@ def project(frame: Frame, means: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
     records = means.new_empty(len(means), RECORD)
     tile_counts = means.new_empty(len(means), dtype=torch.int32)
     depths = torch.empty_like(means[:, 0])
-    frame.point(records=records, tile_counts=tile_counts, depths=depths)
+    frame.pointing(records=records, tile_counts=tile_counts, depths=depths)
     runs.launch("d2_project", _blocks(len(means)), frame)
     by_depth = torch.sort(depths, stable=True).indices
     ends = torch.cumsum(tile_counts[by_depth], 0, dtype=torch.int64)
@@ -174,7 +164,7 @@ def project(frame: Frame, means: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
     parts["by_depth"].copy_(by_depth)
     parts["slot_ends"].copy_(ends)
     slot_tiles, slot_ids = (torch.empty_like(parts["ids"]) for _ in range(2))
-    frame.point(slot_tiles=slot_tiles, slot_ids=slot_ids)
+    frame.pointing(slot_tiles=slot_tiles, slot_ids=slot_ids)
     runs.launch("d2_list", _blocks(len(means)), frame)
     keys = slot_tiles.to(torch.int16) if frame.tiles < 2**15 else slot_tiles  # half the passes of a radix sort
     keys, slots = torch.sort(keys, stable=True)
@@ -202,7 +192,7 @@ def point_lists(frame: Frame, lists: Tensor) -> dict[str, Tensor]:
     frame.pairs = (len(lists) - 2 * frame.count - frame.tiles - 1) // 2
     sizes = [frame.pairs, frame.pairs, frame.count, frame.count, frame.tiles + 1]
     parts = dict(zip(("ids", "slots", "by_depth", "slot_ends", "tile_starts"), torch.split(lists, sizes)))
-    frame.point(**parts)
+    frame.pointing(**parts)
     return parts
 
 
@@ -216,7 +206,7 @@ def backward(frame: Frame, device: torch.device) -> None:
     runs, channels = launcher(device), frame.channels
     # Zeros, since tiles whose pixels are all finished leave the rest of their pairs alone.
     values = torch.zeros(frame.pairs, MOMENTS + channels, device=device)
-    frame.point(values=values, moments=torch.empty(frame.count, MOMENTS, device=device))
+    frame.pointing(values=values, moments=torch.empty(frame.count, MOMENTS, device=device))
     with_front = frame.near_edge and frame.grad_front
     runs.launch("d2_backward_front" if with_front else "d2_backward", frame.tiles, frame)
     if (more := channels - (WARP - MOMENTS)) > 0:
@@ -229,7 +219,7 @@ def gather(frame: Frame, device: torch.device) -> None:
     """Fill the statistics of the survey."""
     runs = launcher(device)
     statistics = STATISTICS + 1 if frame.near_edge else STATISTICS
-    frame.point(values=torch.zeros(frame.pairs, statistics, device=device))
+    frame.pointing(values=torch.zeros(frame.pairs, statistics, device=device))
     runs.launch("d2_survey_front" if frame.near_edge else "d2_survey", frame.tiles, frame)
     runs.launch("d2_gather_survey", _blocks(frame.count * GATHERERS), frame)
 

@@ -12,12 +12,13 @@ import functools
 import warnings
 from collections.abc import Callable
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 
-from d2_plugin.compiler import NoCompiler, load_library
+from d2_plugin.compiler import NoCompiler
+from d2_plugin.compiler.kernels import Call, fields, load_kernel
 from d2_plugin.errors import D2Error
 from d2_plugin.rasterizer.reference import refuse_skew
 
@@ -32,73 +33,47 @@ HEADERS = tuple(KERNELS / name for name in ("splat.h", "simd.h", "parallel.h", "
 FLAGS = ("-ffp-contract=off",)
 """The same formula must give the same bits wherever it is inlined; see kernels/simd.h."""
 
-_float, _int, _long, _bool, _pointer = ctypes.c_float, ctypes.c_int32, ctypes.c_int64, ctypes.c_bool, ctypes.c_void_p
-
-
 Pointing = TypeVar("Pointing", bound="PointingFrame")
 
 
-class PointingFrame(ctypes.Structure):
-    """A C structure with pointers into tensors, which live as long as it does; absent pointers stay null.
+class PointingFrame(Call):
+    """A structure with pointers into tensors, which live as long as it does: the Frames of the CPU and of the GPU."""
 
-    The Frames of the CPU and of the GPU are two of them.
-    """
-
-    def point(self: Pointing, **tensors: Tensor | None) -> Pointing:
-        """Set pointers by name and keep their tensors alive as long as the frame."""
-        for name, tensor in tensors.items():
-            if tensor is not None:
-                setattr(self, name, tensor.data_ptr())
+    def pointing(self: Pointing, **tensors: Tensor | None) -> Pointing:
+        """The frame itself, with pointers by name; it keeps their tensors alive."""
+        self.point(**tensors)
         self.kept = (*getattr(self, "kept", ()), tensors)
         return self
 
 
 class Frame(PointingFrame):
-    """d2::Frame of kernels/frame.h: everything that one call works on; absent pointers stay null."""
+    """d2::Frame of kernels/frame.h: everything that one call works on."""
 
-    _fields_ = (
-        ("rotation", _float * 9),
-        ("translation", _float * 3),
-        *((name, _float) for name in ("focal_x", "focal_y", "center_x", "center_y", "image_width", "image_height")),
-        ("constants", _float * 7),
-        *((name, _int) for name in ("width", "height", "channels", "threads", "chunks")),
-        ("eps", _float),
-        ("count", _long),
-        *(
-            (name, _pointer)
-            for name in (
-                *("means", "covariances", "opacities", "colors", "screen_offsets", "background"),
-                *("prior_depth", "reliability", "near_edge"),
-                *("records", "slots", "tiles", "ids", "blocks"),
-                *("color", "depth_sum", "alpha", "front"),
-                *("grad_color", "grad_depth_sum", "grad_alpha", "grad_front"),
-                *("grad_means", "grad_covariances", "grad_opacities", "grad_colors", "grad_screen_offsets"),
-                *("weight", "error", "max_weight", "front_weight", "hits"),
-            )
-        ),
+    _fields_ = fields(
+        "float rotation[9] translation[3] focal_x focal_y center_x center_y image_width image_height constants[7]",
+        "int width height channels threads chunks",
+        "float eps",
+        "long count",
+        "pointer means covariances opacities colors screen_offsets background prior_depth reliability near_edge",
+        "pointer records slots tiles ids blocks color depth_sum alpha front",
+        "pointer grad_color grad_depth_sum grad_alpha grad_front",
+        "pointer grad_means grad_covariances grad_opacities grad_colors grad_screen_offsets",
+        "pointer weight error max_weight front_weight hits",
     )
 
 
 @functools.cache
-def library() -> ctypes.CDLL:
+def library() -> Any:
     """The compiled kernels.
 
     Raises:
         NoCompiler, CompileError: see `d2_plugin.compiler.load_library`.
     """
-    kernels = load_library("rasterizer", SOURCES, HEADERS, FLAGS)
-    frame = ctypes.POINTER(Frame)
-    signatures = {
-        "d2_frame_size": ((), _long),
-        "d2_tile_count": ((frame,), _int),
-        "d2_project": ((frame,), _long),
-        "d2_render": ((frame, _long), _bool),
-        "d2_survey": ((frame, _long), _bool),
-        "d2_backward": ((frame, _long), _bool),
-    }
-    for name, (arguments, result) in signatures.items():
-        getattr(kernels, name).argtypes, getattr(kernels, name).restype = arguments, result
-    assert kernels.d2_frame_size() == ctypes.sizeof(Frame), "Frame differs between native.py and kernels/frame.h"
+    results = {"d2_tile_count": ctypes.c_int32, "d2_project": ctypes.c_int64}
+    kernels = load_kernel("rasterizer", SOURCES, HEADERS, FLAGS, {"frame": Frame}, results)
+    for name in ("d2_render", "d2_survey", "d2_backward"):
+        function = getattr(kernels, name)
+        function.argtypes, function.restype = (ctypes.POINTER(Frame), ctypes.c_int64), ctypes.c_bool
     return kernels
 
 
@@ -138,14 +113,14 @@ def frame_of(
     refuse_skew(skew)
     frame.image_width, frame.image_height = width, height
     frame.constants[:] = constants
-    return frame.point(means=means, covariances=covariances, opacities=opacities)
+    return frame.pointing(means=means, covariances=covariances, opacities=opacities)
 
 
 def project(frame: Frame, means: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
     """Records [M, 16] and an empty buffer for the lists of pairs of Gaussian and tile."""
     tiles = library().d2_tile_count(frame)
     records = means.new_empty(len(means), RECORD)
-    pairs = library().d2_project(frame.point(records=records))
+    pairs = library().d2_project(frame.pointing(records=records))
     if pairs < 0:
         raise MemoryError(f"no memory for the projection of {len(means)} Gaussians")
     if pairs > 2**31 - 1:
@@ -182,7 +157,7 @@ def gather(frame: Frame, device: torch.device) -> None:
 
 
 def _over_background(frame: Frame) -> Frame:
-    return frame if frame.background else frame.point(background=torch.zeros(frame.channels))
+    return frame if frame.background else frame.pointing(background=torch.zeros(frame.channels))
 
 
 def _run(step: Callable[[Frame, int], bool], frame: Frame) -> None:

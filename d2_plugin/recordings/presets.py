@@ -17,7 +17,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import NamedTuple
 
-from d2_plugin.errors import D2Error, unknown_name
+from d2_plugin.errors import D2Error, refuse_unknown
 from d2_plugin.recordings import Recording, open_recording
 from d2_plugin.recordings.readers.n3dv import UNSYNCHRONISED
 
@@ -118,8 +118,7 @@ def camera_split(recording: Recording, text: str) -> CameraSplit:
             "the camera lists of the D²-4DGS paper are in a supplement that is not public: choose "
             f"preset:4, {', '.join(PROTOCOL + one for one in PROTOCOLS)}, or name the training cameras"
         )
-    if name not in PROTOCOLS:
-        raise unknown_name("protocol", name, PROTOCOLS)
+    refuse_unknown("protocol", [name], PROTOCOLS)
     train = _trained_by_4c4d(recording) if name == "4c4d" else _trained_by_gc_4dgs(recording, int(name[-1]))
     others = tuple(one for one in recording.cameras if one not in train)
     test = others if name == "4c4d" else (min(recording.cameras),)
@@ -133,8 +132,7 @@ def _preset(recording: Recording, preset: str) -> CameraSplit:
     if not preset.startswith(PRESET) or len(dataset) > 1 or views_text not in map(str, VIEWS):
         raise D2Error(f"'{preset}' is no camera preset: expected preset:2, preset:3, preset:4 or preset:n3dv:4")
     name, views = dataset[0] if dataset else _recognised(recording), int(views_text)
-    if name not in RIGS:
-        raise unknown_name("data set", name, RIGS)
+    refuse_unknown("data set", [name], RIGS)
     rig = RIGS[name]
     unsound = [name for name in UNSYNCHRONISED.get(recording.name, ()) if name in recording.cameras]
     sound = [name for name in recording.cameras if name not in unsound]

@@ -8,7 +8,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from d2_plugin.errors import D2Error, unknown_name
+from d2_plugin.errors import D2Error, refuse_unknown
 from d2_plugin.recordings.images import shrink_depth, shrink_image, shrink_mask
 from d2_plugin.recordings.recording import Camera, Recording, Source
 from d2_plugin.values import checked_arguments
@@ -22,9 +22,7 @@ def select_cameras(recording: Recording, cameras: Iterable[str]) -> Recording:
     names = list(cameras)
     if not names:
         raise D2Error(f"no camera chosen from {recording.name}: name at least one of {', '.join(recording.cameras)}")
-    for name in names:
-        if name not in recording.cameras:
-            raise unknown_name("camera", name, recording.cameras)
+    refuse_unknown("camera", names, recording.cameras)
     if len(set(names)) < len(names):
         raise D2Error(f"camera names {', '.join(names)} contain a duplicate: name each camera once")
     return replace(recording, cameras={name: recording.cameras[name] for name in names})

@@ -7,8 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-_VIRIDIS = "440154 472d7b 3b528b 2c728e 21918c 28ae80 5ec962 addc30 fde725"
-_INFERNO = "000004 1b0c41 4a0c6b 781c6d a52c60 cf4446 ed6925 fb9b06 f7d13d fcffa4"
+from d2_plugin.recordings.images import opencv
 
 BACKGROUND, INK = 24, 235
 GAP = 4
@@ -63,21 +62,14 @@ def error_panel(error: np.ndarray, note: str = "") -> Panel:
 
 def color_scale(name: str) -> np.ndarray:
     """Colours uint8 [256, 3] of `viridis` (depth, near is dark) or `inferno` (error, none is black)."""
-    anchors = np.array([list(bytes.fromhex(code)) for code in {"viridis": _VIRIDIS, "inferno": _INFERNO}[name].split()])
-    place = np.linspace(0, len(anchors) - 1, 256)
-    channels = [np.interp(place, np.arange(len(anchors)), anchors[:, channel]) for channel in range(3)]
-    return np.rint(np.stack(channels, axis=-1)).astype(np.uint8)
+    cv2 = opencv("drawing images")
+    colors = cv2.applyColorMap(np.arange(256, dtype=np.uint8)[:, None], getattr(cv2, f"COLORMAP_{name.upper()}"))
+    return np.ascontiguousarray(colors[:, 0, ::-1])
 
 
 def text(line: str, size: int = 1) -> np.ndarray:
-    """Light letters on the background, uint8 [10 size, W, 3].
-
-    Without OpenCV, which draws the letters, an empty strip of one pixel.
-    """
-    try:
-        import cv2
-    except ImportError:
-        return np.full((10 * size, 1, 3), BACKGROUND, np.uint8)
+    """Light letters on the background, uint8 [10 size, W, 3]."""
+    cv2 = opencv("drawing images")
     font, scale = cv2.FONT_HERSHEY_SIMPLEX, 0.3 * size
     (width, _), _ = cv2.getTextSize(line, font, scale, size)
     strip = np.full((10 * size, max(width, 1), 3), BACKGROUND, np.uint8)

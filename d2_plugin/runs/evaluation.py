@@ -15,6 +15,7 @@ from d2_plugin.errors import D2Error
 from d2_plugin.progress import progress_bar
 from d2_plugin.recordings.images import write_png
 from d2_plugin.recordings.recording import Recording
+from d2_plugin.recordings.selection import spread
 from d2_plugin.runs import metrics
 from d2_plugin.runs.drawing import Panel, as_bytes, depth_panel, depth_scale, error_panel, side_by_side
 from d2_plugin.runs.lpips import Lpips, find_lpips
@@ -91,14 +92,12 @@ def evaluate(
 
     Args:
         render: draws one view; colours are clamped to 0..1 here.
-        recording: the truth.
         cameras, frames: what to compare: every camera at every frame.
         output: folder for one image per view, `<camera>_<frame>.png`: truth, render, rendered depth and error side
             by side (and true depth where there is one). No images where None.
         between: frames that were not trained, between others that were. The means leave them out; `psnr` and
             `psnr_moving` over them stand beside the means as `psnr_between` and `psnr_moving_between`.
         lpips, lpips_vgg: from `find_lpips`, on AlexNet and on VGG16; a score is null where its network is None.
-        progress: called after every view.
 
     Returns:
         {"test": mean of each metric over the views that have it (null where none has),
@@ -157,8 +156,7 @@ def still_image(recording: Recording, camera: str, frames: Sequence[int]) -> np.
     """
     if len(frames) < 3:
         return None
-    chosen = np.unique(np.linspace(0, len(frames) - 1, 9).round().astype(int))
-    return np.median([recording.image(camera, frames[i]) for i in chosen], axis=0).astype(np.float32) / 255
+    return np.median([recording.image(camera, f) for f in spread(frames, 9)], axis=0).astype(np.float32) / 255
 
 
 def _inside(recording: Recording, camera: str, frame: int) -> np.ndarray | None:

@@ -18,7 +18,7 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from d2_plugin.errors import D2Error, unknown_name
+from d2_plugin.errors import D2Error, refuse_unknown
 from d2_plugin.reading import opened, parsing
 
 log = logging.getLogger(__name__)
@@ -39,8 +39,7 @@ class Lpips:
     """Learned perceptual distance of two images; `net` is `alex` or `vgg`."""
 
     def __init__(self, net: str, features: Path, linear: Path) -> None:
-        if net not in _TAPS:
-            raise unknown_name("LPIPS network", net, _TAPS)
+        refuse_unknown("LPIPS network", [net], _TAPS)
         self.net = net
         with torch.device("meta"):  # no random initial weights, which would advance the global random state
             self.layers = _alexnet() if net == "alex" else _vgg16()
@@ -80,8 +79,7 @@ class Lpips:
 
 def find_lpips(net: str = "alex", folder: Path | None = None) -> Lpips | None:
     """LPIPS from weight files in `folder` or the usual places, or None (logged once) where there are none."""
-    if net not in _FILES:
-        raise unknown_name("LPIPS network", net, _FILES)
+    refuse_unknown("LPIPS network", [net], _FILES)
     package = importlib.util.find_spec("lpips")
     places = [folder] if folder is not None else [Path(torch.hub.get_dir()) / "checkpoints"]
     if folder is None and package is not None and package.origin:

@@ -16,6 +16,7 @@ from d2_plugin.priors.stereo.settings import NO_MATCHER
 from d2_plugin.recordings import MonoKind, Recording
 from d2_plugin.recordings.cameras.formats.colmap import find_model, read_points
 from d2_plugin.recordings.checks.exposure import FEWEST, relative_exposures
+from d2_plugin.recordings.selection import spread
 from d2_plugin.runs.overlap import Overlap, measure_overlap, measure_texture
 
 CHANGED = 12 / 255
@@ -205,9 +206,7 @@ def _in_words(seen: Overlap) -> str:
 
 def changed_share(recording: Recording, camera: str) -> float:
     """Largest share of a camera's pixels that differ from the first frame, over five frames spread in time."""
-    chosen = np.unique(np.linspace(0, len(recording.frames) - 1, 5).round().astype(int))
-    first = recording.image(camera, recording.frames[0]).astype(np.int16)
-    later = (recording.image(camera, recording.frames[i]).astype(np.int16) for i in chosen[1:])
+    first, *later = (recording.image(camera, frame).astype(np.int16) for frame in spread(recording.frames, 5))
     return float(max(np.mean(np.abs(image - first).max(-1) > CHANGED * 255) for image in later))
 
 

@@ -65,8 +65,6 @@ def make_row(
         error: lower is better; None where it was not measured. Not finite is a failure and is recorded as one.
         seconds: of the work as the kind defines it; None where it was not measured.
         failed: why there is no result, in the method's own words.
-        command: how this was started.
-        device: what torch calls it.
         details: whatever else the kind knows, as JSON can hold it.
     """
     if error is not None and not math.isfinite(error):

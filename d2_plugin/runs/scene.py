@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
-from d2_plugin.errors import D2Error, unknown_name
+from d2_plugin.errors import D2Error, refuse_unknown
 from d2_plugin.hooks import Hook
 from d2_plugin.priors.settings import PriorSettings
 from d2_plugin.recordings import Recording, open_recording
@@ -106,9 +106,7 @@ def _split(recording: Recording, settings: RunSettings) -> tuple[tuple[str, ...]
     test = settings.test_cameras
     if test is None:
         test = tuple(name for name in recording.cameras if name not in settings.train_cameras)
-    for name in (*settings.train_cameras, *test):
-        if name not in recording.cameras:
-            raise unknown_name("camera", name, recording.cameras)
+    refuse_unknown("camera", (*settings.train_cameras, *test), recording.cameras)
     both = sorted(set(settings.train_cameras) & set(test))
     if both:
         raise D2Error(f"camera {both[0]} is named for training and for test: leave it out of one")

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 
 from d2_plugin import registry
 from d2_plugin.config import D2Config, for_iterations
-from d2_plugin.errors import D2Error, unknown_name
+from d2_plugin.errors import D2Error, refuse_unknown, unknown_name
 from d2_plugin.hooks import HOOKS
 from d2_plugin.priors.settings import PriorSettings
 from d2_plugin.reading import said, shown_path
@@ -136,13 +136,9 @@ def _check_device(name: str) -> None:
 
 
 def _check_overrides(settings: RunSettings) -> None:
-    for name in settings.overrides:
-        if name not in TABLES:
-            raise unknown_name("table", name, TABLES)
+    refuse_unknown("table", settings.overrides, TABLES)
     choices = _over({}, settings.overrides.get("plan", {}), "plan")
-    for name in choices:
-        if name not in OVERRIDABLE:
-            raise unknown_name("decision of plan", name, OVERRIDABLE)
+    refuse_unknown("decision of plan", choices, OVERRIDABLE)
     PlanChoices.from_dict(choices, "plan")
     prior_settings(settings)
     hook_config(settings, Path())

@@ -58,7 +58,6 @@ def share(settings: RunSettings, folder: Path, cluster: Mapping[str, Any] | None
 
     Args:
         settings: of any run of the comparison that uses this variant of the prior.
-        folder: of the comparison, absolute.
         cluster: what builds the frames in place of this process, as for `build_priors_for`.
     """
     shared = Shared(folder, prior_settings(settings).variant)

@@ -20,6 +20,7 @@ from d2_plugin.priors.colmap.points import triangulate_frames
 from d2_plugin.protocol import View
 from d2_plugin.reading import parsing
 from d2_plugin.recordings import Recording
+from d2_plugin.recordings.selection import spread
 
 POINTS_FORMAT = 1
 """Of points.npz."""
@@ -223,9 +224,8 @@ def triangulated_points(recording: Recording, cameras: Sequence[str]) -> TimedPo
 
     There are none for a single camera, or where pycolmap is not installed; the latter gives a warning.
     """
-    chosen = np.unique(np.linspace(0, len(recording.frames) - 1, 5).round().astype(int))
     try:
-        triangulated = triangulate_frames(recording, cameras, [recording.frames[i] for i in chosen])
+        triangulated = triangulate_frames(recording, cameras, spread(recording.frames, 5))
     except MissingExtra as error:
         warnings.warn(f"{error}; Gaussians start from random points instead", stacklevel=2)
         return TimedPoints(np.zeros((0, 3)), np.zeros((0, 3), np.float32), np.zeros(0))

@@ -47,6 +47,12 @@ class Estimate:
         return f"{format(self.mean, form)}{error}"
 
 
+def estimated(values: Sequence[float | None], form: str) -> str:
+    """The mean over the seeds with its error; `-` where nothing was measured."""
+    estimate = Estimate.of(values)
+    return "-" if estimate is None else estimate.text(form)
+
+
 @dataclass(frozen=True)
 class Margin:
     """By how much one variant is better than another, over the seeds."""

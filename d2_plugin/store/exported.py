@@ -10,7 +10,7 @@ import logging
 from pathlib import Path
 from typing import Any
 
-from d2_plugin.errors import unknown_name
+from d2_plugin.errors import refuse_unknown
 from d2_plugin.protocol import EXPORT_FILE, DepthPrior
 from d2_plugin.reading import field, parsing, read_json
 from d2_plugin.store.store import PriorStore, other_recording
@@ -72,8 +72,7 @@ class RenamedStore:
         return self._of_source("camera", camera, frame)
 
     def _of_source(self, what: str, camera: str, frame: int, *further: int) -> Any:
-        if camera not in self.sources:
-            raise unknown_name("camera of the export", camera, self.sources)
+        refuse_unknown("camera of the export", [camera], self.sources)
         if frame not in self.frames or camera not in self.cameras:
             return None  # a camera of the recording that the prior was not built for is trained without one
         method = getattr(self.store, what, None)

@@ -22,7 +22,6 @@ def make(backbone: str = "yang4d", temporal: bool = True) -> Example:
     """An example of a bundled backbone with everything that can be checked."""
     model = make_model(backbone=backbone, temporal=temporal)
     if getattr(model, "field", None) is not None:
-        model.deforms = True
         with torch.no_grad():
             for parameter in model.field.heads.parameters():
                 parameter.uniform_(-0.05, 0.05, generator=torch.Generator().manual_seed(1))

@@ -46,7 +46,6 @@ def kind(request: pytest.FixtureRequest) -> str:
 def deforming(kind: str) -> Deform:
     """A model past its warm-up whose field moves things."""
     model, generator = make_model(backbone=kind), torch.Generator().manual_seed(1)
-    model.deforms = True
     with torch.no_grad():
         for parameter in model.field.heads.parameters():
             parameter.uniform_(-0.1, 0.1, generator=generator)
@@ -56,20 +55,10 @@ def deforming(kind: str) -> Deform:
 
 
 class TestModel:
-    def test_warm_up_leaves_the_field_out(self, kind: str) -> None:
-        model = deforming(kind)
-        moved = model.slice_at(make_views()[0]).means
-        model.deforms = False
-        assert model.offsets(model.gaussians["positions"], 0.0) is None
+    def test_a_new_field_moves_nothing(self, kind: str) -> None:
+        model = make_model(backbone=kind)
         assert torch.equal(model.slice_at(make_views()[0]).means, model.gaussians["positions"])
-        assert not torch.equal(moved, model.gaussians["positions"])
-
-    def test_warm_up_ends_at_its_fraction_of_the_run(self, kind: str) -> None:
-        trainer = make_trainer(iterations=40, backbone=kind)
-        trainer.run(until=2)
-        assert not trainer.model.deforms
-        trainer.run(until=3)
-        assert trainer.model.deforms, "0.075 of 40 steps"
+        assert not torch.equal(deforming(kind).slice_at(make_views()[0]).means, model.gaussians["positions"])
 
     def test_a_gaussian_fades_away_from_its_instant_and_goes_where_the_field_says(self, kind: str) -> None:
         model, view, time = deforming(kind), make_views()[0], 0.2
@@ -133,7 +122,7 @@ class TestModel:
         trainer.run(until=10)
         assert trainer.model._noise == 0
 
-    def test_all_parameters_learn_after_the_warm_up(self, kind: str) -> None:
+    def test_all_parameters_learn(self, kind: str) -> None:
         trainer = make_trainer(iterations=30, backbone=kind)
         trainer.run(until=2)
         before = parameters(trainer)
@@ -208,7 +197,6 @@ def bilinear(plane: torch.Tensor, row: torch.Tensor, column: torch.Tensor) -> to
 class TestFields:
     def test_motion_starts_from_none(self, kind: str) -> None:
         model = make_model(backbone=kind)
-        model.deforms = True
         still = model.offsets(model.gaussians["positions"], 0.3)
         assert all(not part.any() for part in still)
 

@@ -59,7 +59,6 @@ def threads(request: pytest.FixtureRequest) -> Iterator[int]:
 def bend_field(model: SplatModel, strength: float = 0.02) -> None:
     """A deformation field, where there is one, moves its Gaussians."""
     if getattr(model, "field", None) is not None:
-        model.deforms = True
         with torch.no_grad():
             for parameter in model.field.heads.parameters():
                 parameter.uniform_(-strength, strength, generator=generator(1))
@@ -191,7 +190,7 @@ def test_a_time_that_is_not_a_number_is_refused(backbone: str) -> None:
 
 
 class TestInsertionIntoADeformationField:
-    def test_during_the_warm_up_canonical_space_is_the_world(self) -> None:
+    def test_with_a_new_field_canonical_space_is_the_world(self) -> None:
         model = make_model(backbone="hexplane")
         points = some_points(6)
         make_adapter(model).insert(points)

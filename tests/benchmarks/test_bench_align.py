@@ -19,7 +19,7 @@ from benchmarks.align_measure import (
     methods,
     optimum,
 )
-from benchmarks.raster_scenes import load_scene
+from benchmarks.raster_scenes import Scene, load_scene
 from benchmarks.stability.gaussians import difference, largest, random_rotation, random_scene
 from benchmarks.stability.sweep import SWEEPS, measure, run_sweeps
 from benchmarks.stability.sweep import tables as sweep_tables
@@ -60,7 +60,8 @@ def test_a_refusal_is_counted_and_no_error_is_made_up_for_it(tmp_path: Path) -> 
 
 
 def test_synthetic_gaussians_have_the_radius_and_the_frustum_they_are_described_with():
-    scene = load_scene("synth:4000", 640, 360).to(torch.float64)
+    made = load_scene("synth:4000", 640, 360)
+    scene = Scene(*(part.double() for part in made[:5]), made.view)
     screen = reference.project(scene.splats(), scene.view, RasterSettings())
     x, y, slope = screen.variance_x, screen.variance_y, screen.slope
     middle, covariance = (x + y) / 2, slope * y

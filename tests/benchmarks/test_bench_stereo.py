@@ -14,11 +14,11 @@ from benchmarks.never_worse.maps import SPOILED, Spoiled, spoiled_recording
 from benchmarks.priors import Case, PriorsBench, cases, rows_of, run
 from benchmarks.priors_section import DIAGONAL, priors
 from benchmarks.stereo import tables
-from benchmarks.stereo_measure import Method, measure, methods, score
+from benchmarks.stereo_measure import VARIANTS, measure, score
 from benchmarks.stereo_rigs import Rig, textured_rig
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.declared_error import NORMAL_SHARE, DeclaredErrors, frames_with_truth, reliability_curve
-from d2_plugin.priors.settings import PriorSettings, StereoSettings
+from d2_plugin.priors.settings import PriorSettings
 from d2_plugin.recordings import open_recording
 from d2_plugin.recordings.export.folder import save_recording
 from d2_plugin.recordings.synthetic.room import synthetic_recording
@@ -59,17 +59,19 @@ def test_covisibility_without_the_other_truth_is_nearly_that_with_it(rig: Rig) -
     assert not alone.covisible[1].any()
 
 
-def test_a_method_that_fails_on_a_rig_says_why_and_counts_as_nothing(rig: Rig) -> None:
+def test_a_setting_that_fails_on_a_rig_says_why_and_counts_as_nothing(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def refuses(*_: object) -> list:
         raise D2Error("disparities span more than the image")
 
-    broken = Method("broken", "default", refuses, StereoSettings())
-    row = measure(broken, [rig])
+    working = measure("2 sources", VARIANTS["2 sources"], [rig])
+    monkeypatch.setattr("benchmarks.stereo_measure.patchmatch", refuses)
+    row = measure("2 sources", VARIANTS["2 sources"], [rig])
     assert row["failed"] == "disparities span more than the image"
-    working = {**measure(methods()[-1], [rig]), "method": "broken", "setting": "default"}
     (_, means), (_, every) = tables([row, working])
-    assert every.rows[0][:6] == ("synthetic2", "2", "192x108", "broken", "default", "failed")
-    assert means.rows[0][:3] == ("broken", "default", f"{working['completeness'] / 2:.3f}")
+    assert every.rows[0][:6] == ("synthetic2", "2", "192x108", "patchmatch", "2 sources", "failed")
+    assert means.rows[0][:3] == ("patchmatch", "2 sources", f"{working['completeness'] / 2:.3f}")
 
 
 @pytest.fixture(scope="module")

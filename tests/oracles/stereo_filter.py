@@ -23,6 +23,20 @@ from d2_plugin.recordings.recording import Camera
 from oracles.surface import interpolated_surface
 
 
+def run(name: str, maps: dict[str, np.ndarray], **numbers: Any) -> None:
+    """What `kernel.run` does, by the functions below."""
+    if name == "slopes":
+        maps["inverse"][:], maps["slope_x"][:], maps["slope_y"][:] = slopes(maps["depth"], numbers["reach"])
+    elif name == "coherence":
+        both = maps["slope_x"], maps["slope_y"]
+        maps["share"][:] = coherence(maps["gray"], maps["inverse"], both, maps["weights"], **numbers)
+    elif name == "scatter":
+        maps["scatter"][:] = scatter(maps["depth"], **numbers)
+    else:
+        given = ("depth", "coherence", "gradient", "parallax", "spread", "scatter")
+        maps["sigma"][:] = sigma(*(maps[part] for part in given))
+
+
 def coherence(
     gray: np.ndarray,
     inverse: np.ndarray,
@@ -32,7 +46,7 @@ def coherence(
     stride: int,
     relative: float,
 ) -> np.ndarray:
-    """What `kernel.coherence` returns, bit for bit; its arguments."""
+    """What `kernel.run("coherence", ...)` writes, bit for bit; its arguments."""
     height, width = inverse.shape
     padded_inverse = np.pad(inverse, radius)
     values = gray.astype(np.int16)
@@ -54,7 +68,7 @@ def _offsets(radius: int, stride: int) -> list[tuple[int, int]]:
 
 
 def slopes(depth: np.ndarray, reach: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What `kernel.slopes` returns, bit for bit: (inverse depth, its slopes), per pixel.
+    """What `kernel.run("slopes", ...)` writes, bit for bit: (inverse depth, its slopes), per pixel.
 
     The flatter one-sided difference: at a depth edge one side runs over the edge and is the steeper one.
     """
@@ -144,7 +158,7 @@ def sigma(
     spread: np.ndarray,
     scatter: np.ndarray,
 ) -> np.ndarray:
-    """What `kernel.sigma` returns, bit for bit; its maps."""
+    """What `kernel.run("sigma", ...)` writes, bit for bit; its maps."""
     known = (depth > 0) & (parallax > 0) & np.isfinite(depth) & ~np.isnan(coherence)
     known &= np.isfinite(spread) & ~np.isnan(gradient)
     coherence, spread = (np.where(known, map_, 0) for map_ in (coherence, spread))
@@ -156,7 +170,7 @@ def sigma(
 
 
 def scatter(depth: np.ndarray, reach: int, slack: float) -> np.ndarray:
-    """What `kernel.scatter` returns, bit for bit; its arguments.
+    """What `kernel.run("scatter", ...)` writes, bit for bit; its arguments.
 
     Moments are about the window's own pixel: those about another one would differ by little from their products.
     """

@@ -24,11 +24,15 @@ from d2_plugin.priors.geometry import (
 from d2_plugin.priors.settings import StereoSettings
 from d2_plugin.priors.stereo.depth_range import depth_bounds
 from d2_plugin.priors.stereo.filtering.filter import GeometricDepth
-from d2_plugin.priors.stereo.geometric_depth import MATCHERS, choose_matcher, enlarged, geometric_depth
+from d2_plugin.priors.stereo.geometric_depth import enlarged, geometric_depth
 from d2_plugin.recordings.recording import Camera, Recording
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 
 pytest.importorskip("cv2")
+try:
+    find_compiler()
+except NoCompiler:
+    pytest.skip("there is no C++ compiler for patchmatch", allow_module_level=True)
 
 
 SETTINGS = StereoSettings(matcher="patchmatch")
@@ -163,23 +167,7 @@ def test_points_behind_or_beside_the_camera_do_not_count(pair: Recording) -> Non
     assert "triangulated" not in depth_bounds(cameras, behind).origin
 
 
-def test_what_is_no_matcher_is_refused() -> None:
-    with pytest.raises(D2Error, match="did you mean 'patchmatch'"):
-        choose_matcher("patch-match")
-    with pytest.raises(D2Error, match="matcher = sensor reads depth that lies beside a recording"):
-        choose_matcher("sensor")
-
-
 BOUNDS = (2.0, 9.0)
-
-
-@pytest.fixture(params=list(MATCHERS))
-def matcher(request: pytest.FixtureRequest) -> str:
-    try:
-        find_compiler()
-    except NoCompiler:
-        pytest.skip("there is no C++ compiler for patchmatch")
-    return request.param
 
 
 @pytest.fixture(scope="module")
@@ -188,8 +176,8 @@ def views() -> tuple[list[np.ndarray], list[Camera]]:
     return [recording.image(name, 0) for name in recording.cameras], list(recording.cameras.values())
 
 
-def valid_share(images: list[np.ndarray], cameras: list[Camera], matcher: str) -> float:
-    results = geometric_depth(images, cameras, BOUNDS, StereoSettings(matcher=matcher))
+def valid_share(images: list[np.ndarray], cameras: list[Camera]) -> float:
+    results = geometric_depth(images, cameras, BOUNDS, StereoSettings())
     for result in results:
         assert np.isfinite(result.depth).all()
     return max(float((result.depth > 0).mean()) for result in results)
@@ -205,7 +193,7 @@ AWAY = np.diag([-1.0, 1.0, -1.0, 1.0])
 
 
 @pytest.mark.parametrize("what", ["no texture", "faint noise", "one camera", "a pure rotation", "no overlap"])
-def test_where_nothing_can_be_matched_there_is_next_to_no_depth(views: tuple, matcher: str, what: str) -> None:
+def test_where_nothing_can_be_matched_there_is_next_to_no_depth(views: tuple, what: str) -> None:
     images, cameras = views
     rng = np.random.default_rng(0)
     noise = [np.clip(128 + rng.normal(0, 2, image.shape), 0, 255).astype(np.uint8) for image in images]
@@ -216,17 +204,15 @@ def test_where_nothing_can_be_matched_there_is_next_to_no_depth(views: tuple, ma
         "a pure rotation": ([images[0]] * 2, [cameras[0], turned(cameras[0], SLIGHTLY)]),
         "no overlap": (images[:2], [cameras[0], turned(cameras[1], AWAY)]),
     }
-    share = valid_share(*given[what], matcher)
+    share = valid_share(*given[what])
     assert share < 0.01 if what == "faint noise" else share == 0
 
 
-def test_one_black_image_neither_has_depth_nor_takes_it_from_the_others(views: tuple, matcher: str) -> None:
+def test_one_black_image_neither_has_depth_nor_takes_it_from_the_others(views: tuple) -> None:
     images, cameras = views
-    results = geometric_depth(
-        [images[0], np.zeros_like(images[1]), images[2]], cameras, BOUNDS, StereoSettings(matcher=matcher)
-    )
+    results = geometric_depth([images[0], np.zeros_like(images[1]), images[2]], cameras, BOUNDS, StereoSettings())
     assert not results[1].depth.any()
-    whole = geometric_depth(images[::2], cameras[::2], BOUNDS, StereoSettings(matcher=matcher))
+    whole = geometric_depth(images[::2], cameras[::2], BOUNDS, StereoSettings())
     assert (results[0].depth > 0).mean() > 0.5 * (whole[0].depth > 0).mean()
 
 

@@ -73,8 +73,7 @@ class TestStereoFilter:
 
     def expected(self, rig: Rig, chosen: StereoSettings = SETTINGS) -> list[np.ndarray]:
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(kernel, "slopes", oracle.slopes)
-            patch.setattr(kernel, "coherence", oracle.coherence)
+            patch.setattr(kernel, "run", oracle.run)
             patch.setattr(confirm, "_add_source", oracle.add_source)
             return self.compiled(rig, chosen)
 
@@ -163,8 +162,7 @@ class TestPrecision:
 
     def expected(self, maps: Maps, window: int = precision.WINDOW) -> tuple[np.ndarray, np.ndarray]:
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(kernel, "sigma", lambda numbers, maps: oracle.sigma(**maps))
-            patch.setattr(kernel, "scatter", oracle.scatter)
+            patch.setattr(kernel, "run", oracle.run)
             return self.compiled(maps, window)
 
     @settings(max_examples=40, deadline=None)

@@ -71,11 +71,10 @@ def test_a_image_rotated_by_its_metadata_keeps_the_stored_pixel_order(tmp_path: 
     assert read_image(path).shape == (20, 30, 3)
 
 
-def test_only_reading_needs_opencv(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The demo must run on a machine with torch and numpy alone."""
-    monkeypatch.setitem(sys.modules, "cv2", None)
+def test_only_images_need_opencv(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     recording = synthetic_recording(cameras=1, frames=1, width=16, height=16)
     save_recording(recording, tmp_path / "scene")
+    monkeypatch.setitem(sys.modules, "cv2", None)
     opened = open_recording(tmp_path / "scene")
     with pytest.raises(MissingExtra, match=r"reading images needs OpenCV.*d2-4dgs\[image\]"):
         opened.image("train0", 0)

@@ -39,7 +39,6 @@ def model(request: pytest.FixtureRequest) -> SplatModel:
     """A model of each kind, past its warm-up, whose field, where it has one, moves things."""
     model = make_model(backbone=request.param)
     if getattr(model, "field", None) is not None:
-        model.deforms = True
         with torch.no_grad():
             for parameter in model.field.heads.parameters():
                 parameter.uniform_(-0.02, 0.02, generator=torch.Generator().manual_seed(1))
@@ -191,7 +190,6 @@ def test_case_31_a_huge_velocity_is_culled_and_trained(model: SplatModel) -> Non
 def test_case_32_a_field_rests_outside_of_the_scenes_time(time: float) -> None:
     for backbone in ("mlp", "hexplane"):
         model = make_model(backbone=backbone)
-        model.deforms = True
         step(model, time=time)
         end = 0.0 if time < 0 else model.duration
         inside, outside = (model.slice_at(replace(make_views()[0], time=t)) for t in (end, time))

@@ -23,8 +23,8 @@ import numpy as np
 
 from d2_plugin.errors import D2Error
 from d2_plugin.extras import import_pycolmap
-from d2_plugin.priors.geometry import relative_pose
 from d2_plugin.reading import said
+from d2_plugin.recordings.cameras.epipolar import sampson
 from d2_plugin.recordings.recording import Camera, Recording
 
 LUMA = np.array([0.299, 0.587, 0.114])
@@ -88,7 +88,6 @@ def triangulate(
 
     Args:
         images: RGB uint8 [H, W, 3], one per camera.
-        cameras: their calibrations.
         frame: what to note as the points' frame.
 
     Returns:
@@ -158,13 +157,12 @@ def _matched_pairs(features: Sequence[Features], cameras: Sequence[Camera]) -> d
     pairs = {}
     for i, j in itertools.combinations(range(len(cameras)), 2):
         if not same_spot(cameras[i], cameras[j]):
-            fundamental = fundamental_matrix(cameras[i], cameras[j])
-            pairs[i, j] = epipolar_matches(features[i], features[j], fundamental)
+            pairs[i, j] = epipolar_matches(features[i], features[j], cameras[i], cameras[j])
     return {pair: matches for pair, matches in pairs.items() if len(matches)}
 
 
-def epipolar_matches(first: Features, second: Features, fundamental: np.ndarray) -> np.ndarray:
-    """Pairs of feature indices [M, 2] that are each other's nearest, unambiguous, and fit the geometry F [3, 3]."""
+def epipolar_matches(first: Features, second: Features, one: Camera, other: Camera) -> np.ndarray:
+    """Pairs of feature indices [M, 2] that are each other's nearest, unambiguous, and fit what two cameras see."""
     if min(len(first.pixels), len(second.pixels)) < 2:
         return np.zeros((0, 2), np.int64)
     forward = _nearest(first.descriptors, second.descriptors)
@@ -172,8 +170,8 @@ def epipolar_matches(first: Features, second: Features, fundamental: np.ndarray)
     here = np.flatnonzero(forward >= 0)
     here = here[backward[forward[here]] == here]
     matches = np.stack([here, forward[here]], axis=1)
-    error = sampson_distance(fundamental, first.pixels[matches[:, 0]], second.pixels[matches[:, 1]])
-    return matches[error <= EPIPOLAR_ERROR]
+    error = sampson(one, other, first.pixels[matches[:, 0]], second.pixels[matches[:, 1]])
+    return matches[np.abs(error) <= EPIPOLAR_ERROR]
 
 
 def _nearest(queries: np.ndarray, candidates: np.ndarray, block: int = 1024) -> np.ndarray:
@@ -190,26 +188,10 @@ def _nearest(queries: np.ndarray, candidates: np.ndarray, block: int = 1024) -> 
     return nearest
 
 
-def sampson_distance(fundamental: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """First-order distance [M] in pixels of matched points [M, 2] from the epipolar geometry F [3, 3]."""
-    x, y = (np.concatenate([points, np.ones((len(points), 1))], axis=1) for points in (first, second))
-    line_second, line_first = x @ fundamental.T, y @ fundamental
-    gradient = np.hypot(np.hypot(*line_second[:, :2].T), np.hypot(*line_first[:, :2].T))
-    return np.abs((y * line_second).sum(axis=1)) / np.maximum(gradient, np.finfo(float).tiny)
-
-
 def same_spot(first: Camera, second: Camera) -> bool:
     """Whether two cameras stand on the same spot, up to rounding: they see no parallax."""
     baseline = np.linalg.norm(first.centre - second.centre)
     return bool(baseline <= 1e-9 * max(1.0, np.abs(first.centre).max()))
-
-
-def fundamental_matrix(first: Camera, second: Camera) -> np.ndarray:
-    """F [3, 3] with y^T F x = 0 for pixels x of `first` and y of `second` of one world point."""
-    pose = relative_pose(first, second)
-    rotation, (x, y, z) = pose[:3, :3], pose[:3, 3]
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.linalg.inv(second.K).T @ cross @ rotation @ np.linalg.inv(first.K)
 
 
 def _triangulated(

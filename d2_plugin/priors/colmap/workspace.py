@@ -233,9 +233,7 @@ def scale_of_world(cameras: Sequence[Camera], poses: dict[str, np.ndarray], fold
     """Our world units per unit of the workspace, from the translations between cameras.
 
     Args:
-        cameras: ours.
         poses: T_camera_world [4, 4] in the workspace's world, by name.
-        folder: of the workspace, for the message.
 
     Raises:
         D2Error: the poses differ by more than a similarity, or a single camera's by anything at all.

@@ -12,11 +12,12 @@ import functools
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
-from d2_plugin.compiler import load_library
+from d2_plugin.compiler.kernels import load_kernel, structure
 from d2_plugin.priors.geometry import CONTINUOUS, view_pair
 from d2_plugin.protocol import Label
 from d2_plugin.recordings.recording import Camera
@@ -58,8 +59,6 @@ MISSED = 0.5
 OVERSHOT = 2.0
 """Nor is one whose first step is so many times farther than allowed."""
 
-_int, _float, _double, _pointer = ctypes.c_int32, ctypes.c_float, ctypes.c_double, ctypes.c_void_p
-
 
 @dataclass(frozen=True, eq=False)
 class View:
@@ -77,34 +76,19 @@ class View:
     """Mean of 3x3 pixels, uint8 [H, W, 3]; None where there is no image."""
 
 
-class _View(ctypes.Structure):
-    """d2::View of kernels/cross_view.cpp."""
-
-    _fields_ = (
-        *((name, _int) for name in ("width", "height")),
-        ("agreeing", _double),
-        *((name, _pointer) for name in ("labels", "depth", "log", "sigma", "colors")),
-        *((name, _pointer) for name in ("new_labels", "new_depth", "new_sigma")),
-    )
-
-
-class _Pair(ctypes.Structure):
-    """d2::Pair of kernels/cross_view.cpp."""
-
-    _fields_ = (("A", _double * 9), ("k", _double * 3), ("gain", _float * 3))
-
-
-class _Instant(ctypes.Structure):
-    """d2::Instant of kernels/cross_view.cpp."""
-
-    _fields_ = (
-        *((name, _int) for name in ("count", "threads", "compared", "steps", "fewest")),
-        *((name, _float) for name in ("continuous", "like", "dark")),
-        *((name, _double) for name in ("tolerance", "at_best", "alone", "one_place", "within", "near", "beside")),
-        *((name, _double) for name in ("nudge", "log_nudge", "flattest", "longest", "met", "missed", "overshot")),
-        *((name, ctypes.c_uint8) for name in ("label_mono", "label_agreed", "label_verified")),
-        *((name, _pointer) for name in ("views", "pairs")),
-    )
+_View = structure(
+    "int width height", "double agreeing", "pointer labels depth log sigma colors new_labels new_depth new_sigma"
+)
+_Pair = structure("double A[9] k[3]", "float gain[3]")
+_Instant = structure(
+    "int count threads compared steps fewest",
+    "float continuous like dark",
+    "double tolerance at_best alone one_place within near beside",
+    "double nudge log_nudge flattest longest met missed overshot",
+    "byte label_mono label_agreed label_verified",
+    "pointer views pairs",
+)
+"""d2::View, Pair and Instant of kernels/cross_view.cpp."""
 
 
 _NUMBERS = {
@@ -132,19 +116,14 @@ _NUMBERS = {
 
 
 @functools.cache
-def library() -> ctypes.CDLL:
+def library() -> Any:
     """The compiled kernel.
 
     Raises:
         NoCompiler, CompileError: see `d2_plugin.compiler.load_library`.
     """
-    kernel = load_library("cross_view", (SOURCE,), HEADERS, FLAGS)
-    kernel.d2_compare_views.argtypes, kernel.d2_compare_views.restype = (ctypes.POINTER(_Instant),), None
-    for name, structure in ("instant", _Instant), ("pair", _Pair), ("view", _View):
-        size = getattr(kernel, f"d2_{name}_size")
-        size.restype = ctypes.c_int64
-        assert size() == ctypes.sizeof(structure), f"{structure.__name__} differs between kernel.py and cpp"
-    return kernel
+    calls = {"instant": _Instant, "pair": _Pair, "view": _View}
+    return load_kernel("cross_view", (SOURCE,), HEADERS, FLAGS, calls, {"d2_compare_views": None})
 
 
 def compare_views(
@@ -156,8 +135,6 @@ def compare_views(
     """(labels, depth, sigma) of each view after its mono-only pixels were compared with all others (`with_evidence`).
 
     Args:
-        views: by camera.
-        cameras: their calibrations.
         agreeing: by camera, the factor of sigma where another map agrees.
         numbers: `tolerance` in log depth, the factor of sigma `alone`, and `at_best`.
     """
@@ -167,28 +144,17 @@ def compare_views(
     pairs = (_Pair * count**2)(*(_pair(cameras[ours], cameras[theirs]) for ours in views for theirs in views))
     call = _Instant(**_NUMBERS, **numbers, count=count, threads=torch.get_num_threads())
     call.views, call.pairs = ctypes.addressof(given), ctypes.addressof(pairs)
-    library().d2_compare_views(ctypes.byref(call))
+    library().d2_compare_views(call)
     return changed
 
 
-def _view(view: View, changed: tuple[np.ndarray, np.ndarray, np.ndarray], agreeing: float) -> _View:
-    call = _View(agreeing=agreeing, labels=_address(view.labels, np.uint8), colors=_address(view.colors, np.uint8))
+def _view(view: View, changed: tuple[np.ndarray, np.ndarray, np.ndarray], agreeing: float) -> Any:
+    call = _View(agreeing=agreeing)
     call.height, call.width = view.labels.shape
-    call.depth, call.log, call.sigma = (_address(map_, np.float32) for map_ in (view.depth, view.log, view.sigma))
-    types = np.uint8, np.float32, np.float32
-    call.new_labels, call.new_depth, call.new_sigma = map(_address, changed, types)
+    call.point(**vars(view), **dict(zip(("new_labels", "new_depth", "new_sigma"), changed)))
     return call
 
 
-def _pair(ours: Camera, theirs: Camera) -> _Pair:
+def _pair(ours: Camera, theirs: Camera) -> Any:
     pair = view_pair(ours, theirs)
     return _Pair(A=tuple(pair.A.ravel().tolist()), k=tuple(pair.k.tolist()), gain=(1, 1, 1))
-
-
-def _address(array: np.ndarray | None, dtype: type) -> int | None:
-    """Where an array lies, which must be contiguous and of that type."""
-    if array is None:
-        return None
-    assert array.flags.c_contiguous, "a kernel walks over contiguous memory"
-    assert array.dtype == dtype, f"a kernel was promised {dtype.__name__} and got {array.dtype}"
-    return array.ctypes.data

@@ -68,7 +68,6 @@ def aligned_across(views: Mapping[str, Shown], kind: MonoKind) -> dict[str, Alig
 
     Args:
         views: synchronized views. Those with well spread anchors keep their lines and help the others.
-        kind: what the maps are.
     """
     wanted = [name for name, view in views.items() if is_open(view)]
     if not wanted:
@@ -118,7 +117,6 @@ def shared_scale(maps: Mapping[str, np.ndarray], cameras: Mapping[str, Camera], 
 
     Args:
         maps: planar depth [H, W] by camera, up to the factor; NaN or 0 where there is none.
-        cameras: their calibrations.
         tried: factors, ascending; more are tried between the best and its neighbours.
     """
     nothing = Alignment(AlignStatus.NOT_ALIGNED, "metric")

@@ -64,7 +64,6 @@ def fit_affine(
 
     Args:
         x: [n] what is aligned (a monocular prediction).
-        y: [n] what it is aligned to.
         weights: [n] multiplies each residual; 1 where None.
         epsilon: smoothing of rho, in units of weights * y; must be positive.
         tolerance: relative duality gap to stop at.

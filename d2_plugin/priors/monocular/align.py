@@ -12,7 +12,7 @@ from typing import NamedTuple, get_args
 
 import numpy as np
 
-from d2_plugin.errors import D2Error, unknown_name
+from d2_plugin.errors import D2Error, refuse_unknown
 from d2_plugin.priors.monocular.affine import AffineFit, fit_affine
 from d2_plugin.priors.monocular.settings import AlignSettings
 from d2_plugin.recordings.recording import MonoKind
@@ -97,7 +97,6 @@ def align(mono: np.ndarray, geometric: np.ndarray, *, kind: MonoKind, settings: 
     Args:
         mono: D^m float [H, W]: inverse depth up to scale and shift (`relative`), or depth (`metric`).
         geometric: D^g float [H, W], planar depth, 0 or NaN where unknown.
-        kind: what `mono` is.
         settings: residual, smoothing and when a fit is refused.
 
     Raises:
@@ -271,5 +270,4 @@ def _check(mono: np.ndarray, geometric: np.ndarray, kind: str) -> None:
         raise D2Error(
             f"the monocular map is {mono.shape} but geometric depth is {geometric.shape}: resize the map first"
         )
-    if kind not in KINDS:
-        raise unknown_name("monocular kind", kind, KINDS)
+    refuse_unknown("monocular kind", [kind], KINDS)

@@ -44,9 +44,7 @@ def corrected_without(
     """`corrected_depth` once for each of several choices of anchors, float32 [n, H, W].
 
     Args:
-        aligned, geometric: as above.
         left_out: anchors that do not count, bool [n, H, W].
-        settings: as above.
     """
     known = (aligned > 0) & (geometric > 0)
     if not settings.local_correction or not known.any():

@@ -35,7 +35,6 @@ def extrapolation_error(
         aligned: aligned monocular depth [H, W], 0 where it has none.
         anchors: D^g [H, W], 0 where there are none.
         kind: what the map was before: relative ones are lines in inverse depth.
-        settings: of the fit.
     """
     known = (anchors > 0) & (aligned > 0)
     if not known.any():

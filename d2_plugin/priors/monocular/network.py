@@ -17,7 +17,7 @@ from typing import Any, get_args
 
 import numpy as np
 
-from d2_plugin.errors import D2Error, missing_extra, unknown_name
+from d2_plugin.errors import D2Error, missing_extra, refuse_unknown, unknown_name
 from d2_plugin.priors.monocular.align import KINDS
 from d2_plugin.priors.settings import Preprocessing
 from d2_plugin.reading import parsing, said
@@ -83,7 +83,6 @@ class MonocularModel:
     """A monocular depth network; call it with an image.
 
     Args:
-        path: the ONNX file.
         kind: `relative` (inverse depth) or `metric` (depth).
         preprocessing: `depth_anything_v2` (cubic resize, ImageNet mean and deviation), `unit` (0..1), or `auto`.
         threads: of one inference; one per worker process is fastest for frames that are independent.
@@ -105,8 +104,7 @@ class MonocularModel:
         self.path, self.kind = Path(path), kind
         if kind not in KINDS:
             raise unknown_name("monocular kind", str(kind), KINDS)
-        if preprocessing not in PREPROCESSINGS:
-            raise unknown_name("preprocessing", preprocessing, PREPROCESSINGS)
+        refuse_unknown("preprocessing", [preprocessing], PREPROCESSINGS)
         self.session = _session(self.path, threads)
         self.input = NetworkInput.of(self.session, self.path, views)
         self.preprocessing = _recognised(self.input) if preprocessing == "auto" else preprocessing

@@ -112,7 +112,6 @@ def monocular_uncertainty(
     Args:
         aligned: aligned monocular depth before local correction [H, W], 0 where it has none.
         geometric: D^g, the anchors [H, W], 0 where there are none.
-        settings: of the local correction.
         confidence: the map's own, in any unit [H, W]: errors are spread as 1 / confidence besides, and how large they
             are is measured as ever. None is 1 everywhere.
         kind: what the map is: its line is one in inverse depth or in depth. None is a map known up to a scale, which

@@ -49,7 +49,6 @@ def fitted(
     Args:
         maps: in the scale of the recording, by camera.
         anchors: D^g [H, W] of the same views, 0 where there is none.
-        cameras: their calibrations.
         settings: of the multi-view source, and of what makes a fit acceptable.
     """
     least, groups = settings.align.min_anchors, [[name] for name in maps]

@@ -17,6 +17,7 @@ from d2_plugin.priors.multiview.scale import log_ratio, world_scale
 from d2_plugin.priors.settings import PriorSettings
 from d2_plugin.recordings.images import opencv
 from d2_plugin.recordings.recording import Camera, Recording
+from d2_plugin.recordings.selection import spread
 from d2_plugin.store.files import EntryFolder, hash_of
 from d2_plugin.values import shown
 
@@ -50,11 +51,7 @@ class MultiviewSource:
     """Multi-view depth of a recording.
 
     Args:
-        recording: whose cameras and images.
-        names: the training cameras.
-        settings: `multiview` and its kin.
         cache: folder for the predictions of an ONNX network.
-        read: reads the images of one frame.
 
     Raises:
         D2Error: no such files or network, or a network for another number of views.
@@ -143,8 +140,7 @@ class MultiviewSource:
         if self._scale is None:
             there = [frame for frame in self.frames if self.has(frame)]
             first = self._predicted(there[0])
-            spread = np.unique(np.linspace(0, len(there) - 1, SCALED_AT).round().astype(int))
-            logs = np.array([self._measured(there[place], first) for place in spread])
+            logs = np.array([self._measured(frame, first) for frame in spread(there, SCALED_AT)])
             logs = logs[np.isfinite(logs)]
             self._scale = float(np.median(logs)) if logs.size else 0.0, first
         scale, first = self._scale

@@ -33,7 +33,6 @@ def depth_bounds(
     Matchers take a range ten times too wide.
 
     Args:
-        cameras: the cameras that are matched.
         points: world points [N, 3] triangulated with the known poses, or None.
         max_angle: what two cameras see at a wider angle than this cannot be matched, degrees; it bounds the near end
             where nothing else does.

@@ -1,4 +1,4 @@
-"""Geometric depth of one timestamp: choose a matcher, match at two sizes, filter each, bring back to full size.
+"""Geometric depth of one timestamp: match at two sizes, filter each, bring back to full size.
 
 A wall with little texture says nothing in a window of eleven pixels, and more at half the size. What is left empty at
 the chosen size is filled with what passes the same filter at half of it, and is declared less exact."""
@@ -6,13 +6,12 @@ the chosen size is filled with what passes the same filter at half of it, and is
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import repeat
 
 import numpy as np
 
-from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.priors.geometry import check_depth_range, check_views, scaled_camera
 from d2_plugin.priors.stereo.filtering.confirm import RELATIVE_DEPTH
 from d2_plugin.priors.stereo.filtering.filter import GeometricDepth, filter_depths
@@ -22,26 +21,11 @@ from d2_plugin.priors.stereo.settings import StereoSettings
 from d2_plugin.recordings.images import opencv
 from d2_plugin.recordings.recording import Camera
 
-RawDepth = tuple[np.ndarray, np.ndarray]
-"""Planar depth float32 [H, W] (0 = none) and matching cost 1 - NCC float32 [H, W] in 0..2."""
-
-Matcher = Callable[..., list[RawDepth]]
-"""(grey uint8 [H, W] per camera, cameras, (near, far), settings, wanted) -> raw depth and cost per camera.
-
-`wanted` is None or bool [H, W] per camera: a matcher may leave out all other pixels.
-"""
-
 LUMA = np.array([0.299, 0.587, 0.114], np.float32)  # ITU-R BT.601, as every codec of the recordings uses
 
 SCALES = (1, 2)
 """Images are matched at this many times fewer pixels each way in turn; a later one fills what the earlier leave empty.
 At a quarter of the size edges fatten."""
-
-MATCHERS: dict[str, Matcher] = {"patchmatch": patchmatch}
-"""Matchers by their name in the settings."""
-
-ON_DISK = ("sensor", "workspace")
-"""What the setting `matcher` may name besides: depth beside a recording (`d2_plugin.priors.depth_on_disk`)."""
 
 
 def geometric_depth(
@@ -49,7 +33,6 @@ def geometric_depth(
     cameras: Sequence[Camera],
     depth_range: tuple[float, float],
     settings: StereoSettings,
-    matcher: str | None = None,
     memories: Sequence[MatchMemory] | None = None,
 ) -> list[GeometricDepth]:
     """D^g of every view from the synchronized views of one timestamp, and of no other.
@@ -58,8 +41,6 @@ def geometric_depth(
         images: RGB uint8 [H, W, 3] per camera.
         cameras: at least two, in the same order.
         depth_range: near and far in world units; ten times too wide does no harm.
-        settings: matching and filtering.
-        matcher: name in `MATCHERS` or `auto`; settings.matcher where None.
         memories: by scale, matches of the frames before, which are carried over where the images did not change, and
             which this frame's are added to.
 
@@ -67,19 +48,16 @@ def geometric_depth(
         Per camera the filtered depth; empty everywhere where nothing can be known (no texture, one centre).
 
     Raises:
-        D2Error: fewer than two views, images of another size than their camera, an inverted range, an unknown
-            matcher.
+        D2Error: fewer than two views, images of another size than their camera, an inverted range.
     """
     check_views(images, cameras)
     depth_range = check_depth_range(depth_range)
-    match = MATCHERS[choose_matcher(matcher or settings.matcher)]
     grays = [gray(image) for image in images]
     by_scale = []
     for scale, memory in zip(SCALES, memories or repeat(None)):
-        small = [_shrunk(*view, settings.max_pixels, scale) for view in zip(grays, cameras)]
-        filtered = _matched(
-            [pair[0] for pair in small], [pair[1] for pair in small], match, depth_range, settings, memory, scale
-        )
+        shrunk = [_shrunk(*view, settings.max_pixels, scale) for view in zip(grays, cameras)]
+        small, small_cameras = zip(*shrunk)
+        filtered = _matched(small, small_cameras, depth_range, settings, memory, scale)
         tolerance = RELATIVE_DEPTH * scale
         by_scale.append(
             [enlarged(one, camera.width, camera.height, tolerance) for one, camera in zip(filtered, cameras)]
@@ -90,7 +68,6 @@ def geometric_depth(
 def _matched(
     grays: Sequence[np.ndarray],
     cameras: Sequence[Camera],
-    match: Matcher,
     depth_range: tuple[float, float],
     settings: StereoSettings,
     memory: MatchMemory | None,
@@ -99,7 +76,7 @@ def _matched(
     """Filtered depth at one size; what did not change since the frame before is not matched again."""
     wanted = None if memory is None else memory.wanted(grays)
     matched = None if wanted is None else [widened(mask, MARGIN) for mask in wanted]
-    raw = match(grays, cameras, depth_range, settings, matched)
+    raw = patchmatch(grays, cameras, depth_range, settings, matched)
     if memory is not None:
         raw = memory.merge(grays, raw, wanted)
     depths, costs = zip(*raw)
@@ -114,19 +91,6 @@ def _filled(results: Sequence[GeometricDepth]) -> GeometricDepth:
         depth[empty], sigma[empty] = coarser.depth[empty], coarser.sigma[empty]
     survivors = results[0].record["survivors"] | {"filled": int(np.count_nonzero(depth))}
     return GeometricDepth(depth, sigma, {"survivors": survivors})
-
-
-def choose_matcher(name: str) -> str:
-    """The name of the matcher that `auto` stands for, or `name` itself if it is known.
-
-    Raises:
-        D2Error: an unknown name, or one that stands for depth on disk.
-    """
-    if name in ON_DISK:
-        raise D2Error(f"matcher = {name} reads depth that lies beside a recording: build the priors of that recording")
-    if name != "auto" and name not in MATCHERS:
-        raise unknown_name("stereo matcher", name, [*MATCHERS, *ON_DISK, "auto"])
-    return "patchmatch" if name == "auto" else name
 
 
 def gray(image: np.ndarray) -> np.ndarray:

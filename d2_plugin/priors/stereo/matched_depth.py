@@ -15,7 +15,7 @@ from d2_plugin.priors.frame import Frame
 from d2_plugin.priors.geometric_source import GeometricSource
 from d2_plugin.priors.stereo.depth_range import DepthBounds
 from d2_plugin.priors.stereo.filtering.filter import GeometricDepth
-from d2_plugin.priors.stereo.geometric_depth import SCALES, choose_matcher, geometric_depth
+from d2_plugin.priors.stereo.geometric_depth import SCALES, geometric_depth
 from d2_plugin.priors.stereo.reuse import MatchMemory
 from d2_plugin.priors.stereo.settings import StereoSettings
 from d2_plugin.recordings.recording import Camera
@@ -25,12 +25,9 @@ class MatchedDepth(GeometricSource):
     """Filtered geometric depth that is matched between the cameras.
 
     Args:
-        cameras: the cameras that are matched.
-        bounds: depth range that is searched.
         settings: matching, filtering, carrying over.
         cache: folder below which depth is kept.
         frames: all frame numbers of the build, ascending.
-        read: reads the images of one frame.
     """
 
     def __init__(
@@ -42,7 +39,7 @@ class MatchedDepth(GeometricSource):
         frames: Sequence[int],
         read: Callable[[int], Frame],
     ) -> None:
-        super().__init__(cameras, bounds, settings, choose_matcher(settings.matcher), cache / "stereo")
+        super().__init__(cameras, bounds, settings, "patchmatch", cache / "stereo")
         self.depth_range = bounds[:2]
         self.read = read
         self._before = {after: before for block in frame_blocks(frames, settings) for before, after in pairwise(block)}
@@ -66,7 +63,7 @@ class MatchedDepth(GeometricSource):
             self._computed(self.read(before))
         images = [frame.images[camera.name] for camera in self.cameras]
         memories = self._memories if self.settings.reuse_static else None
-        results = geometric_depth(images, self.cameras, self.depth_range, self.settings, self.matcher, memories)
+        results = geometric_depth(images, self.cameras, self.depth_range, self.settings, memories)
         self._remembered = key
         matched_share = 1.0 if memories is None else round(memories[0].matched_share, 6)
         return [replace(result, record=result.record | {"matched_share": matched_share}) for result in results]

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ctypes
 import functools
+from typing import Any
 
 import numpy as np
 import torch
@@ -39,9 +40,7 @@ class Call(ctypes.Structure):
 
     _fields_ = (
         ("task", Task),
-        ("colour", ctypes.c_int32),
-        ("round", ctypes.c_int32),
-        ("radius", ctypes.c_int32),
+        *((name, ctypes.c_int32) for name in ("colour", "round", "radius")),
         ("tolerance", ctypes.c_float),
         ("averaged", ctypes.c_void_p),
     )
@@ -89,7 +88,7 @@ class CudaPatchMatchKernel(PatchMatchKernel):
         self.device = current_device()
         self._driver = driver(self.device)
 
-    def _spread(self, task: Task, arrays: Arrays) -> None:
+    def _spread(self, task: Any, arrays: Arrays) -> None:
         on_device = self._moved(task, arrays)
         call = Call(task=task)
         pixels, half = task.width * task.height, -(-task.width // 2) * task.height
@@ -100,7 +99,7 @@ class CudaPatchMatchKernel(PatchMatchKernel):
         for name in ("planes", "costs"):
             arrays[name][...] = on_device[name].cpu().numpy()
 
-    def _average(self, task: Task, arrays: Arrays) -> np.ndarray:
+    def _average(self, task: Any, arrays: Arrays) -> np.ndarray:
         on_device = self._moved(task, arrays)
         planes, averaged = on_device["planes"], torch.empty_like(on_device["planes"])
         for _ in range(CONSENSUS_PASSES):
@@ -114,7 +113,7 @@ class CudaPatchMatchKernel(PatchMatchKernel):
     def _launch(self, kernel: str, sources: int, count: int, call: Call) -> None:
         self._driver.launch(kernel, sources, (-(-count // THREADS), 1), THREADS, call)
 
-    def _moved(self, task: Task, arrays: Arrays) -> dict[str, torch.Tensor]:
+    def _moved(self, task: Any, arrays: Arrays) -> dict[str, torch.Tensor]:
         """Copies of the arrays on the device, which the task points to then; they must outlive its use."""
         tensors = {}
         for name, array in arrays.items():

@@ -6,16 +6,17 @@ import ctypes
 import math
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
 from d2_plugin.compiler import load_library
+from d2_plugin.compiler.kernels import Call, structure
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.geometry import index_intrinsics, view_pair
 from d2_plugin.priors.stereo.pyramid import NO_MATCH, LevelView
 from d2_plugin.priors.stereo.settings import StereoSettings
-from d2_plugin.recordings.recording import Camera
 
 KERNELS = Path(__file__).parent / "kernels"
 FLAGS = ("-fopenmp-simd", "-ffp-contract=off")
@@ -37,29 +38,17 @@ CONSENSUS_TOLERANCE = 0.02
 """Neighbouring planes agree when they pass within this share of the inverse depth."""
 
 
-_float, _int, _pointer = ctypes.c_float, ctypes.c_int32, ctypes.c_void_p
+Source = structure("int width height first", "float A[9] k[3]")
+"""d2::Source of kernels/matching.h: a view as the reference sees it."""
 
-
-class Source(ctypes.Structure):
-    """d2::Source of kernels/matching.h: a view as the reference sees it."""
-
-    _fields_ = (
-        *((name, _int) for name in ("width", "height", "first")),
-        ("A", _float * 9),
-        ("k", _float * 3),
-    )
-
-
-class Task(ctypes.Structure):
-    """d2::Task of kernels/spread.h: what the planes of one reference view spread by."""
-
-    _fields_ = (
-        ("intrinsics", _float * 4),
-        *((name, _int) for name in ("width", "height", "source_count", "rounds", "draw_planes", "explore", "threads")),
-        ("seed", ctypes.c_uint32),
-        *((name, _float) for name in ("inverse_far", "inverse_near", "per_gray")),
-        *((name, _pointer) for name in ("gray", "wanted", "sources", "quads", "planes", "costs", "views")),
-    )
+Task = structure(
+    "float intrinsics[4]",
+    "int width height source_count rounds draw_planes explore threads",
+    "unsigned seed",
+    "float inverse_far inverse_near per_gray",
+    "pointer gray wanted sources quads planes costs views",
+)
+"""d2::Task of kernels/spread.h: what the planes of one reference view spread by."""
 
 
 Arrays = dict[str, np.ndarray]
@@ -107,25 +96,27 @@ class PatchMatchKernel:
         """Replace each plane by the mean of those around it that agree with it."""
         view.planes = self._average(self._task(view), self._view_arrays(view))
 
-    def _spread(self, task: Task, arrays: Arrays) -> None:
+    def _spread(self, task: Call, arrays: Arrays) -> None:
         """Let planes spread; writes the arrays `planes` and `costs`."""
-        self.library.d2_patchmatch(ctypes.byref(_pointed(task, arrays)))
+        task.point(**arrays)
+        self.library.d2_patchmatch(ctypes.byref(task))
 
-    def _average(self, task: Task, arrays: Arrays) -> np.ndarray:
+    def _average(self, task: Call, arrays: Arrays) -> np.ndarray:
         """The planes after all passes of the consensus."""
-        tolerance = _float(CONSENSUS_TOLERANCE)
+        tolerance = ctypes.c_float(CONSENSUS_TOLERANCE)
         planes, averaged = arrays["planes"], np.empty_like(arrays["planes"])
         for _ in range(CONSENSUS_PASSES):
-            call = ctypes.byref(_pointed(task, arrays | {"planes": planes}))
-            self.library.d2_consensus(call, CONSENSUS_RADIUS, tolerance, _pointer(averaged.ctypes.data))
+            task.point(**arrays | {"planes": planes})
+            written = ctypes.c_void_p(averaged.ctypes.data)
+            self.library.d2_consensus(ctypes.byref(task), CONSENSUS_RADIUS, tolerance, written)
             planes, averaged = averaged, np.empty_like(planes)
         return planes
 
-    def _task(self, view: LevelView) -> Task:
+    def _task(self, view: LevelView) -> Any:
         """What is the same of all calls for one view of one resolution."""
-        near, far = self.depth_range
+        (near, far), K = self.depth_range, index_intrinsics(view.camera)
         return Task(
-            intrinsics=_intrinsics(view.camera),
+            intrinsics=(K[0, 0], K[1, 1], K[0, 2], K[1, 2]),
             width=view.gray.shape[1],
             height=view.gray.shape[0],
             threads=torch.get_num_threads(),
@@ -150,24 +141,6 @@ class PatchMatchKernel:
         return {"sources": np.frombuffer(bytes(sources), np.uint8), "quads": quads}
 
 
-def _pointed(task: Task, arrays: Arrays) -> Task:
-    """The task with its pointers; the arrays must outlive its use."""
-    for name, array in arrays.items():
-        setattr(task, name, array.ctypes.data)
-    return task
-
-
-def _intrinsics(camera: Camera) -> ctypes.Array:
-    K = index_intrinsics(camera)
-    return (_float * 4)(K[0, 0], K[1, 1], K[0, 2], K[1, 2])
-
-
-def _source(reference: LevelView, source: LevelView, first: int) -> Source:
+def _source(reference: LevelView, source: LevelView, first: int) -> Any:
     pair = view_pair(reference.camera, source.camera)
-    return Source(
-        source.camera.width,
-        source.camera.height,
-        first,
-        (_float * 9)(*pair.A.ravel()),
-        (_float * 3)(*pair.k),
-    )
+    return Source(source.camera.width, source.camera.height, first, tuple(pair.A.ravel()), tuple(pair.k))

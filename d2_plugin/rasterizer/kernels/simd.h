@@ -39,15 +39,7 @@ struct Floats {
   Native v;
   Floats() = default;
   D2_INLINE Floats(Native native) : v(native) {}
-  D2_INLINE Floats(float value) {
-#if defined(D2_AVX512)
-    v = _mm512_set1_ps(value);
-#elif defined(D2_AVX2)
-    v = _mm256_set1_ps(value);
-#else
-    v = Native{value, value, value, value};
-#endif
-  }
+  D2_INLINE Floats(float value) : v(value - Native{}) {}
   static D2_INLINE Floats load(const float* from) {
     Floats out;
     std::memcpy(&out.v, from, sizeof(Native));
@@ -63,19 +55,14 @@ D2_INLINE Floats operator/(Floats a, Floats b) { return a.v / b.v; }
 D2_INLINE Floats operator-(Floats a) { return -a.v; }
 
 #if defined(D2_AVX512)
-
 struct Mask {
   __mmask16 bits;
 };
 D2_INLINE Mask operator&(Mask a, Mask b) { return {__mmask16(a.bits & b.bits)}; }
 D2_INLINE Mask andnot(Mask a, Mask b) { return {__mmask16(a.bits & ~b.bits)}; }
-D2_INLINE bool any(Mask a) { return a.bits != 0; }
-D2_INLINE int count(Mask a) { return __builtin_popcount(a.bits); }
 D2_INLINE unsigned lanes(Mask a) { return a.bits; }
 D2_INLINE Mask operator>(Floats a, Floats b) { return {_mm512_cmp_ps_mask(a.v, b.v, _CMP_GT_OQ)}; }
 D2_INLINE Mask operator>=(Floats a, Floats b) { return {_mm512_cmp_ps_mask(a.v, b.v, _CMP_GE_OQ)}; }
-D2_INLINE Mask operator<(Floats a, Floats b) { return b > a; }
-D2_INLINE Mask operator<=(Floats a, Floats b) { return b >= a; }
 D2_INLINE Floats select(Mask m, Floats yes, Floats no) { return _mm512_mask_mov_ps(no.v, m.bits, yes.v); }
 D2_INLINE Floats where(Mask m, Floats yes) { return _mm512_maskz_mov_ps(m.bits, yes.v); }
 D2_INLINE Floats fma(Floats a, Floats b, Floats c) { return _mm512_fmadd_ps(a.v, b.v, c.v); }
@@ -83,62 +70,33 @@ D2_INLINE Floats fnma(Floats a, Floats b, Floats c) { return _mm512_fnmadd_ps(a.
 D2_INLINE Floats min(Floats a, Floats b) { return _mm512_min_ps(a.v, b.v); }
 D2_INLINE Floats max(Floats a, Floats b) { return _mm512_max_ps(a.v, b.v); }
 D2_INLINE Floats sqrt(Floats a) { return _mm512_sqrt_ps(a.v); }
-D2_INLINE Floats abs(Floats a) { return _mm512_abs_ps(a.v); }
-D2_INLINE Floats negative(Floats a) { return _mm512_or_ps(a.v, _mm512_set1_ps(-0.f)); }  // -|a|
 D2_INLINE Floats floor(Floats a) { return _mm512_roundscale_ps(a.v, _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC); }
-D2_INLINE Floats add_to_exponent(Floats a, Floats low_bits) {
-  const __m512i exponent = _mm512_slli_epi32(_mm512_castps_si512(low_bits.v), 23);
-  return _mm512_castsi512_ps(_mm512_add_epi32(_mm512_castps_si512(a.v), exponent));
-}
-D2_INLINE Floats reciprocal(Floats a) {
-  const Floats estimate = _mm512_rcp14_ps(a.v);
-  return estimate * fnma(a, estimate, Floats(2.f));
-}
-D2_INLINE Floats reciprocal_root(Floats a) {
-  const Floats estimate = _mm512_rsqrt14_ps(a.v);
-  return estimate * fnma(Floats(0.5f) * a * estimate, estimate, Floats(1.5f));
-}
+D2_INLINE Floats near_reciprocal(Floats a) { return _mm512_rcp14_ps(a.v); }
+D2_INLINE Floats near_reciprocal_root(Floats a) { return _mm512_rsqrt14_ps(a.v); }
 D2_INLINE float sum(Floats a) { return _mm512_reduce_add_ps(a.v); }
 D2_INLINE float largest(Floats a) { return _mm512_reduce_max_ps(a.v); }
-
-#elif defined(D2_AVX2)
-
+#else
 struct Mask {
-  __m256 v;
+  Integers v;
 };
-D2_INLINE Mask operator&(Mask a, Mask b) { return {_mm256_and_ps(a.v, b.v)}; }
-D2_INLINE Mask andnot(Mask a, Mask b) { return {_mm256_andnot_ps(b.v, a.v)}; }
-D2_INLINE unsigned lanes(Mask a) { return unsigned(_mm256_movemask_ps(a.v)); }
-D2_INLINE bool any(Mask a) { return lanes(a) != 0; }
-D2_INLINE int count(Mask a) { return __builtin_popcount(lanes(a)); }
-D2_INLINE Mask operator>(Floats a, Floats b) { return {_mm256_cmp_ps(a.v, b.v, _CMP_GT_OQ)}; }
-D2_INLINE Mask operator>=(Floats a, Floats b) { return {_mm256_cmp_ps(a.v, b.v, _CMP_GE_OQ)}; }
-D2_INLINE Mask operator<(Floats a, Floats b) { return b > a; }
-D2_INLINE Mask operator<=(Floats a, Floats b) { return b >= a; }
+D2_INLINE Mask operator&(Mask a, Mask b) { return {a.v & b.v}; }
+D2_INLINE Mask andnot(Mask a, Mask b) { return {a.v & ~b.v}; }
+D2_INLINE Mask operator>(Floats a, Floats b) { return {a.v > b.v}; }
+D2_INLINE Mask operator>=(Floats a, Floats b) { return {a.v >= b.v}; }
 D2_INLINE Floats select(Mask m, Floats yes, Floats no) {
-  return _mm256_or_ps(_mm256_and_ps(m.v, yes.v), _mm256_andnot_ps(m.v, no.v));
+  return Native((Integers(yes.v) & m.v) | (Integers(no.v) & ~m.v));
 }
-D2_INLINE Floats where(Mask m, Floats yes) { return _mm256_and_ps(m.v, yes.v); }
+D2_INLINE Floats where(Mask m, Floats yes) { return Native(Integers(yes.v) & m.v); }
+#if defined(D2_AVX2)
+D2_INLINE unsigned lanes(Mask a) { return unsigned(_mm256_movemask_ps(__m256(a.v))); }
 D2_INLINE Floats fma(Floats a, Floats b, Floats c) { return _mm256_fmadd_ps(a.v, b.v, c.v); }
 D2_INLINE Floats fnma(Floats a, Floats b, Floats c) { return _mm256_fnmadd_ps(a.v, b.v, c.v); }
 D2_INLINE Floats min(Floats a, Floats b) { return _mm256_min_ps(a.v, b.v); }
 D2_INLINE Floats max(Floats a, Floats b) { return _mm256_max_ps(a.v, b.v); }
 D2_INLINE Floats sqrt(Floats a) { return _mm256_sqrt_ps(a.v); }
-D2_INLINE Floats abs(Floats a) { return _mm256_andnot_ps(_mm256_set1_ps(-0.f), a.v); }
-D2_INLINE Floats negative(Floats a) { return _mm256_or_ps(a.v, _mm256_set1_ps(-0.f)); }
 D2_INLINE Floats floor(Floats a) { return _mm256_floor_ps(a.v); }
-D2_INLINE Floats reciprocal(Floats a) {
-  const Floats estimate = _mm256_rcp_ps(a.v);
-  return estimate * fnma(a, estimate, Floats(2.f));
-}
-D2_INLINE Floats reciprocal_root(Floats a) {
-  const Floats estimate = _mm256_rsqrt_ps(a.v);
-  return estimate * fnma(Floats(0.5f) * a * estimate, estimate, Floats(1.5f));
-}
-D2_INLINE Floats add_to_exponent(Floats a, Floats low_bits) {
-  const __m256i exponent = _mm256_slli_epi32(_mm256_castps_si256(low_bits.v), 23);
-  return _mm256_castsi256_ps(_mm256_add_epi32(_mm256_castps_si256(a.v), exponent));
-}
+D2_INLINE Floats near_reciprocal(Floats a) { return _mm256_rcp_ps(a.v); }
+D2_INLINE Floats near_reciprocal_root(Floats a) { return _mm256_rsqrt_ps(a.v); }
 D2_INLINE float sum(Floats a) {
   __m128 s = _mm_add_ps(_mm256_castps256_ps128(a.v), _mm256_extractf128_ps(a.v, 1));
   s = _mm_add_ps(s, _mm_movehl_ps(s, s));
@@ -149,54 +107,54 @@ D2_INLINE float largest(Floats a) {
   s = _mm_max_ps(s, _mm_movehl_ps(s, s));
   return _mm_cvtss_f32(_mm_max_ss(s, _mm_movehdup_ps(s)));
 }
-
 #else
-
-struct Mask {
-  Integers v;
-};
-D2_INLINE Mask operator&(Mask a, Mask b) { return {a.v & b.v}; }
-D2_INLINE Mask andnot(Mask a, Mask b) { return {a.v & ~b.v}; }
 D2_INLINE unsigned lanes(Mask a) { return (a.v[0] & 1) | (a.v[1] & 2) | (a.v[2] & 4) | (a.v[3] & 8); }
-D2_INLINE bool any(Mask a) { return (a.v[0] | a.v[1] | a.v[2] | a.v[3]) != 0; }
-D2_INLINE int count(Mask a) { return -(a.v[0] + a.v[1] + a.v[2] + a.v[3]); }
-D2_INLINE Mask operator>(Floats a, Floats b) { return {a.v > b.v}; }
-D2_INLINE Mask operator>=(Floats a, Floats b) { return {a.v >= b.v}; }
-D2_INLINE Mask operator<(Floats a, Floats b) { return {a.v < b.v}; }
-D2_INLINE Mask operator<=(Floats a, Floats b) { return {a.v <= b.v}; }
-D2_INLINE Floats select(Mask m, Floats yes, Floats no) {
-  return Native((Integers(yes.v) & m.v) | (Integers(no.v) & ~m.v));
-}
-D2_INLINE Floats where(Mask m, Floats yes) { return Native(Integers(yes.v) & m.v); }
 D2_INLINE Floats fma(Floats a, Floats b, Floats c) { return a * b + c; }
 D2_INLINE Floats fnma(Floats a, Floats b, Floats c) { return c - a * b; }
-D2_INLINE Floats min(Floats a, Floats b) { return select(a < b, a, b); }
+D2_INLINE Floats min(Floats a, Floats b) { return select(b > a, a, b); }
 D2_INLINE Floats max(Floats a, Floats b) { return select(a > b, a, b); }
 D2_INLINE Floats sqrt(Floats a) {
   return Native{__builtin_sqrtf(a.v[0]), __builtin_sqrtf(a.v[1]), __builtin_sqrtf(a.v[2]), __builtin_sqrtf(a.v[3])};
 }
-D2_INLINE Floats abs(Floats a) { return Native(Integers(a.v) & 0x7fffffff); }
-D2_INLINE Floats negative(Floats a) { return Native(Integers(a.v) | int32_t(0x80000000)); }
 // Beyond 2^22 a float is an integer as far as any pixel is concerned; converting more than 2^31 would be undefined.
-D2_INLINE Floats round(Floats a) {
+D2_INLINE Floats floor(Floats a) {
   const Floats bounded = max(min(a, Floats(4194304.f)), Floats(-4194304.f));
   const Floats magic = 12582912.f;  // 1.5 * 2^23: adding it leaves no bits for a fraction
-  return select(abs(a) < Floats(4194304.f), (bounded + magic) - magic, a);
-}
-D2_INLINE Floats floor(Floats a) {
-  const Floats near = round(a);
+  const Floats magnitude = Native(Integers(a.v) & 0x7fffffff);
+  const Floats near = select(Floats(4194304.f) > magnitude, (bounded + magic) - magic, a);
   return near - where(near > a, Floats(1.f));
-}
-D2_INLINE Floats reciprocal(Floats a) { return Floats(1.f) / a; }
-D2_INLINE Floats reciprocal_root(Floats a) { return Floats(1.f) / sqrt(a); }
-D2_INLINE Floats add_to_exponent(Floats a, Floats low_bits) {
-  return Native(Integers(a.v) + (Integers(low_bits.v) << 23));
 }
 D2_INLINE float sum(Floats a) { return (a.v[0] + a.v[2]) + (a.v[1] + a.v[3]); }
 D2_INLINE float larger(float a, float b) { return a > b ? a : b; }
 D2_INLINE float largest(Floats a) { return larger(larger(a.v[0], a.v[2]), larger(a.v[1], a.v[3])); }
-
 #endif
+#endif
+
+D2_INLINE bool any(Mask a) { return lanes(a) != 0; }
+D2_INLINE int count(Mask a) { return __builtin_popcount(lanes(a)); }
+D2_INLINE Mask operator<(Floats a, Floats b) { return b > a; }
+D2_INLINE Mask operator<=(Floats a, Floats b) { return b >= a; }
+D2_INLINE Floats abs(Floats a) { return Native(Integers(a.v) & 0x7fffffff); }
+D2_INLINE Floats negative(Floats a) { return Native(Integers(a.v) | int32_t(0x80000000)); }  // -|a|
+D2_INLINE Floats add_to_exponent(Floats a, Floats low_bits) {
+  return Native(Integers(a.v) + (Integers(low_bits.v) << 23));
+}
+D2_INLINE Floats reciprocal(Floats a) {
+#if defined(D2_AVX512) || defined(D2_AVX2)
+  const Floats estimate = near_reciprocal(a);
+  return estimate * fnma(a, estimate, Floats(2.f));
+#else
+  return Floats(1.f) / a;
+#endif
+}
+D2_INLINE Floats reciprocal_root(Floats a) {
+#if defined(D2_AVX512) || defined(D2_AVX2)
+  const Floats estimate = near_reciprocal_root(a);
+  return estimate * fnma(Floats(0.5f) * a * estimate, estimate, Floats(1.5f));
+#else
+  return Floats(1.f) / sqrt(a);
+#endif
+}
 
 // LANES bytes as numbers.
 D2_INLINE Floats load_bytes(const uint8_t* from) {

@@ -32,7 +32,6 @@ def sift_features(
         image: RGB uint8 [H, W, 3].
         most: features, those of the highest contrast.
         purpose: what needs OpenCV, in the sentence that says where it is missing.
-        contrast: of a feature, at least.
         mask: bool [H, W], where features may lie.
         tilted: in the image as nine cameras would see it from aside (Morel and Yu 2009: ASIFT), `most` in each.
     """

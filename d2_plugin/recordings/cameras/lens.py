@@ -17,7 +17,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from d2_plugin.errors import D2Error, unknown_name
+from d2_plugin.errors import D2Error, refuse_unknown
 from d2_plugin.values import shown
 
 Model = Literal["pinhole", "opencv", "fisheye"]
@@ -79,8 +79,7 @@ def checked_lens(K: np.ndarray, model: str, distortion: np.ndarray | tuple[float
         D2Error: an unknown model, a coefficient that no lens has, or one that the model has no place for, as of thin
             prism and tilted models.
     """
-    if model not in MODELS:
-        raise unknown_name(f"camera model of {where}", model, MODELS)
+    refuse_unknown(f"camera model of {where}", [model], MODELS)
     values = np.ravel(np.asarray(distortion, np.float64))
     if not (np.abs(values) <= LARGEST_COEFFICIENT).all():
         raise D2Error(

@@ -36,7 +36,6 @@ def relative_exposures(
     the points is its gain: hidden points and highlights are outliers of both.
 
     Args:
-        recording: the recording.
         cameras: whom to compare; at least two.
         positions, times: points [P, 3] in the world and the seconds at which each was seen.
     """

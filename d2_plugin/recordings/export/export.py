@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from d2_plugin.errors import D2Error, unknown_name
+from d2_plugin.errors import D2Error, refuse_unknown
 from d2_plugin.protocol import EXPORT_FILE
 from d2_plugin.reading import json_text
 from d2_plugin.recordings.cameras.formats.cameras_json import refuse_skew
@@ -54,7 +54,6 @@ def export_recording(
 
     Args:
         recording: cameras and frames to write; restrict it with `select_cameras`, `select_frames` and `downscale`.
-        layout: see the module's description.
         path: a folder that does not exist or is empty.
         test_cameras: held out, in the way the layout can say it: a file of their own, or the first place.
         cloud: initial points; times are seconds since the first frame. None leaves them to the trainer.
@@ -62,8 +61,7 @@ def export_recording(
     Raises:
         D2Error: what the layout cannot hold (principal points, several focal lengths, skew), by camera.
     """
-    if layout not in WRITERS:
-        raise unknown_name("layout", layout, WRITERS)
+    refuse_unknown("layout", [layout], WRITERS)
     held_out = _known(recording, test_cameras)
     if cloud is not None:
         cloud.check()
@@ -92,9 +90,7 @@ def _calibration(camera: Camera) -> dict[str, Any]:
 
 
 def _known(recording: Recording, test_cameras: Sequence[str]) -> tuple[str, ...]:
-    for name in test_cameras:
-        if name not in recording.cameras:
-            raise unknown_name("camera", name, recording.cameras)
+    refuse_unknown("camera", test_cameras, recording.cameras)
     if set(test_cameras) >= set(recording.cameras):
         raise D2Error(f"all cameras of {recording.name} are held out: leave at least one to train on")
     return tuple(test_cameras)

@@ -11,7 +11,7 @@ import math
 from pathlib import Path
 from typing import NamedTuple, Optional
 
-from d2_plugin.errors import D2Error, unknown_name
+from d2_plugin.errors import D2Error, refuse_unknown
 from d2_plugin.reading import field, read_json
 from d2_plugin.recordings.assembly import CORRECT, assembled
 from d2_plugin.recordings.cameras.camera import CalibratedCamera, check_name, checked_rate
@@ -50,9 +50,7 @@ def open_transforms(path: Path, cameras: tuple[str, ...] | None = None, intersec
     entries, notes = _present(_entries(path), intersect)
     shots, fps = _shots(entries, path)
     files = by_camera(shots, {name: entry.file for name, entry in entries.items()})
-    for name in cameras or ():
-        if name not in files:
-            raise unknown_name("camera", name, files)
+    refuse_unknown("camera", cameras or (), files)
     images = {name: files[name] for name in (cameras or files)}
     frames, frame_notes = common_frames(images, path)
     first = {shot.camera: entries[name] for name, shot in shots.items() if shot.frame == frames[0]}

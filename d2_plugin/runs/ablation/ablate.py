@@ -14,7 +14,7 @@ from d2_plugin.runs.settings import RunSettings, prior_settings
 from d2_plugin.runs.shared import Shared, share, share_points
 from d2_plugin.runs.tables import STUDY_COLUMNS, Table, markdown
 from d2_plugin.runs.training.measured import Work, side_by_side
-from d2_plugin.runs.verdict import EXPLANATION, Estimate, seeds_in_words, verdicts_table
+from d2_plugin.runs.verdict import EXPLANATION, estimated, seeds_in_words, verdicts_table
 
 MARK = "○"
 """What a published figure carries in a table, where ours carry nothing."""
@@ -117,7 +117,7 @@ def table(runs: Mapping[str, Sequence[Row]], published: Mapping[str, float] | No
     for name, mine in runs.items():
         shown = [([score.get(column.key) for score in scores[name]], column.form) for column in columns]
         shown += [([row.get("gaussians") for row in mine], ".0f"), ([row["seconds"] for row in mine], ".1f")]
-        lines.append([_title(name), seeds_in_words(len(mine)), *(_cell(*values) for values in shown)])
+        lines.append([_title(name), seeds_in_words(len(mine)), *(estimated(*values) for values in shown)])
         if published:
             lines[-1].append(f"{published[name]:.2f}" if name in published else "-")
     header += [f"{MARK} paper's PSNR"] if published else []
@@ -137,8 +137,3 @@ def _scores(row: Row) -> dict[str, float | None]:
 
 def _title(name: str) -> str:
     return PRESETS[name].title if name in PRESETS else name
-
-
-def _cell(values: Sequence[float | None], form: str) -> str:
-    estimate = Estimate.of(values)
-    return "-" if estimate is None else estimate.text(form)

@@ -10,7 +10,7 @@ from d2_plugin.runs.report.page import Section, sources_of
 from d2_plugin.runs.report.svg import Axis, Plot, Point, Series, figure
 from d2_plugin.runs.rows import TRY, Row
 from d2_plugin.runs.tables import STUDY_COLUMNS, Column, Table
-from d2_plugin.runs.verdict import EXPLANATION, Estimate, seeds_in_words, verdicts_table
+from d2_plugin.runs.verdict import EXPLANATION, Estimate, estimated, seeds_in_words, verdicts_table
 
 D2, STEREO, BACKBONE = "D²", "stereo alone", "backbone alone"
 NAMES = {"full": D2, "+ D2": D2, "mvs_only": STEREO, "backbone": BACKBONE, "": BACKBONE}
@@ -161,16 +161,11 @@ def scores_table(groups: Sequence[Group]) -> Table:
     titles = (*(column.title for column in columns), *(title for title, _, _ in COSTS))
     cells = []
     for group in groups:
-        shown = [_text(group.scores(column), column.form) for column in columns]
-        shown += [_text([row.get(key) for row in group.rows], form) for _, key, form in COSTS]
+        shown = [estimated(group.scores(column), column.form) for column in columns]
+        shown += [estimated([row.get(key) for row in group.rows], form) for _, key, form in COSTS]
         cells.append((group.case, group.length, group.method, seeds_in_words(len(group.rows)), *shown))
     best = {(row, place) for place, column in enumerate(columns, start=4) for row in _best(groups, column)}
     return Table(("recording", "at", "method", "seeds", *titles), tuple(cells), frozenset(best))
-
-
-def _text(values: Sequence[float | None], form: str) -> str:
-    estimate = Estimate.of(values)
-    return "-" if estimate is None else estimate.text(form)
 
 
 def _best(groups: Sequence[Group], column: Column) -> list[int]:

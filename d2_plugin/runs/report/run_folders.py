@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from d2_plugin.errors import MissingExtra
-from d2_plugin.recordings.images import opencv, read_image, shrink_image
+from d2_plugin.recordings.images import encode_jpeg, read_image, shrink_image
 from d2_plugin.runs.rows import Row, case_name, command_line, make_row, rms_error
 from d2_plugin.runs.saved import read_metrics, read_run
 from d2_plugin.runs.settings import HOOK_NAMES, RunSettings
@@ -74,10 +74,8 @@ def image_of(folder: Path) -> tuple[str, str] | None:
         return None
     path = images[len(images) // 2]
     try:
-        cv2 = opencv("images in a report")
+        image = read_image(path)
     except MissingExtra:
         return None
-    image = read_image(path)
-    image = shrink_image(image, -(-image.shape[1] // IMAGE_WIDTH))
-    encoded = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 88])[1]
-    return path.stem, f"data:image/jpeg;base64,{base64.b64encode(encoded.tobytes()).decode()}"
+    encoded = encode_jpeg(shrink_image(image, -(-image.shape[1] // IMAGE_WIDTH)), 88)
+    return path.stem, f"data:image/jpeg;base64,{base64.b64encode(encoded).decode()}"

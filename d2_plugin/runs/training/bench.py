@@ -90,7 +90,6 @@ def run(
     """Measure what is missing; where the rows lie.
 
     Args:
-        settings: what is compared, and on what.
         presets, tables: methods by name, and tables of such names, that `settings.methods` may hold.
         name: of the command, as rows have it.
     """

@@ -38,7 +38,6 @@ def sharp_model(backbone: str, count: int = 400, **options: object) -> SplatMode
             model.background.constant.normal_(0, 0.2, generator=generator)
             model.background.harmonics.normal_(0, 0.2, generator=generator)
         if backbone == "hexplane":
-            model.deforms = True
             for plane in model.field.time:
                 plane += 0.3 * torch.randn(plane.shape, generator=generator)
             model.field.heads.weight.normal_(0, 0.2, generator=generator)

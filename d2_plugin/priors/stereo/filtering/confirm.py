@@ -78,19 +78,21 @@ def _add_source(
     rays = np.linalg.inv(index_intrinsics(reference))
     pair, back = view_pair(reference, source), view_pair(source, reference)
     low, high = np.deg2rad(settings.min_angle), np.deg2rad(settings.max_angle)
-    numbers = {
-        "their_height": theirs.shape[0],
-        "their_width": theirs.shape[1],
-        "between": settings.between_pixels,
-        "continuous": CONTINUOUS,
-        "reprojection_max": REPROJECTION_MAX,
-        "relative_depth_max": tolerance,
-        "sine_min": np.sin(low),
-        "cosine_min": np.cos(low),
-        "sine_max": np.sin(high),
-        "cosine_max": np.cos(high),
-        "nudge": np.exp(NUDGE),
-        "nudge_squared": NUDGE**2,
-    }
     vectors = {"A": pair.A, "k": pair.k, "back_A": back.A, "back_k": back.k, "direction": pair.direction, "rays": rays}
-    kernel.confirm(depth.shape, numbers, vectors, {"depth": depth, "theirs": theirs, **sums._asdict()})
+    kernel.run(
+        "confirm",
+        {"depth": depth, "theirs": theirs, **sums._asdict()},
+        **vectors,
+        their_height=theirs.shape[0],
+        their_width=theirs.shape[1],
+        between=settings.between_pixels,
+        continuous=CONTINUOUS,
+        reprojection_max=REPROJECTION_MAX,
+        relative_depth_max=tolerance,
+        sine_min=np.sin(low),
+        cosine_min=np.cos(low),
+        sine_max=np.sin(high),
+        cosine_max=np.cos(high),
+        nudge=np.exp(NUDGE),
+        nudge_squared=NUDGE**2,
+    )

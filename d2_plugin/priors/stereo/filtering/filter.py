@@ -68,10 +68,8 @@ def filter_depths(
 
     Args:
         grays: uint8 [H, W] per camera.
-        cameras: the cameras, in the same order.
         depths: raw planar depth float32 [H, W] per camera, 0 or NaN where the matcher has none.
         costs: matching cost 1 - NCC float32 [H, W] per camera.
-        settings: thresholds.
         tolerance: depths of one surface differ by less than this share.
 
     Returns:
@@ -139,10 +137,16 @@ def surface_coherence(gray: np.ndarray, depth: np.ndarray, tolerance: float = RE
         float32 [H, W] in 0..1; 0 where there is no depth.
     """
     cv2 = opencv("the filter of geometric depth")
-    inverse, across, down = kernel.slopes(np.ascontiguousarray(depth, np.float32), SLOPE_REACH)
-    slopes = cv2.medianBlur(across, 5), cv2.medianBlur(down, 5)
+    depth = np.ascontiguousarray(depth, np.float32)
+    inverse, across, down, share = (np.empty_like(depth) for _ in range(4))
+    # The flatter one-sided difference: at a depth edge the other side runs over it; a side without depth has no say.
+    kernel.run("slopes", {"depth": depth, "inverse": inverse, "slope_x": across, "slope_y": down}, reach=SLOPE_REACH)
+    maps = {"slope_x": cv2.medianBlur(across, 5), "slope_y": cv2.medianBlur(down, 5), "share": share}
+    # By difference of grey values; the last weight, 0, is that of a pixel outside.
     weights = np.append(np.exp(-0.5 * (np.arange(256) / 255 / CONTRAST) ** 2), 0).astype(np.float32)
-    return kernel.coherence(np.ascontiguousarray(gray), inverse, slopes, weights, REACH, STRIDE, tolerance)
+    maps |= {"gray": np.ascontiguousarray(gray), "inverse": inverse, "weights": weights}
+    kernel.run("coherence", maps, radius=REACH, stride=STRIDE, relative=tolerance)
+    return share
 
 
 def remove_speckles(depth: np.ndarray, tolerance: float = RELATIVE_DEPTH) -> np.ndarray:

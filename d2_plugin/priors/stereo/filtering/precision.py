@@ -69,19 +69,20 @@ def geometric_sigma(
         "parallax": np.ascontiguousarray(parallax, np.float64),
         "spread": np.ascontiguousarray(spread, np.float64),
         "scatter": plane_scatter(depth),
+        "sigma": np.empty(depth.shape, np.float32),
     }
-    return kernel.sigma(_NUMBERS, maps)
-
-
-_NUMBERS = {
-    "matching": MATCHING,
-    "gray_noise": GRAY_NOISE,
-    "flattest": FLATTEST,
-    "per_incoherence": PER_INCOHERENCE,
-    "of_scatter": OF_SCATTER,
-    "of_spread": OF_SPREAD,
-    "floor_squared": FLOOR**2,
-}
+    kernel.run(
+        "sigma",
+        maps,
+        matching=MATCHING,
+        gray_noise=GRAY_NOISE,
+        flattest=FLATTEST,
+        per_incoherence=PER_INCOHERENCE,
+        of_scatter=OF_SCATTER,
+        of_spread=OF_SPREAD,
+        floor_squared=FLOOR**2,
+    )
+    return maps["sigma"]
 
 
 def grey_gradient(gray: np.ndarray) -> np.ndarray:
@@ -102,5 +103,6 @@ def plane_scatter(depth: np.ndarray, window: int = WINDOW) -> np.ndarray:
         depth: [H, W], read as float32; 0, infinite or NaN where there is none.
         window: side of the window, pixels, odd.
     """
-    depth = np.ascontiguousarray(depth, np.float32)
-    return kernel.scatter(depth, window // 2, SLACK)
+    depth, scatter = np.ascontiguousarray(depth, np.float32), np.empty(depth.shape)
+    kernel.run("scatter", {"depth": depth, "scatter": scatter}, reach=window // 2, slack=SLACK)
+    return scatter
