@@ -12,6 +12,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import torch
+
 from d2_plugin.errors import D2Error
 
 ODD_VALUES: tuple[Any, ...] = (
@@ -94,20 +97,35 @@ def mutate_file(path: Path, rng: random.Random) -> None:
         path.write_bytes(mutated_bytes(data, rng))
 
 
-def expect_result_or_sentence(call: Callable[[], Any], seed: object) -> bool:
-    """Whether `call` gave a result; a D2Error of one sentence is as good, and anything else fails with the seed."""
+def leaves(value: Any) -> list[Any]:
+    """What a value holds, to be compared."""
+    if isinstance(value, dict):
+        return [leaf for name in sorted(value, key=str) for leaf in (str(name), *leaves(value[name]))]
+    if isinstance(value, list | tuple):
+        return [leaf for item in value for leaf in leaves(item)]
+    if isinstance(value, torch.Tensor | np.ndarray):
+        return [str(value.dtype), tuple(value.shape), np.asarray(value).tobytes()]
+    return [value]
+
+
+def expect_result_or_sentence(call: Callable[[], Any], seed: object, expected: list[Any] | None = None) -> bool:
+    """Whether `call` gave a result, with the leaves that are `expected`; a D2Error of one sentence is as good.
+
+    Anything else fails with the seed.
+    """
     start = time.monotonic()
     try:
-        call()
-        refused = None
+        found, refused = call(), None
     except D2Error as error:
         refused = str(error)
     except Exception as failure:
         raise AssertionError(f"mutation {seed}: {type(failure).__name__}: {failure}") from failure
     assert time.monotonic() - start < MOST_SECONDS, f"mutation {seed} took {time.monotonic() - start:.1f} s"
     if refused is not None:
-        assert 10 < len(refused) < 2000, f"mutation {seed}: {refused[:3000]}"
+        assert 10 < len(refused) < (2000 if expected is None else 1000), f"mutation {seed}: {refused[:3000]}"
+        assert expected is None or "\n" not in refused, f"mutation {seed}: {refused}"
         refused.encode()
+    assert refused is not None or expected is None or leaves(found) == expected, f"mutation {seed}"
     return refused is None
 
 

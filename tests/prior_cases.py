@@ -14,23 +14,14 @@ from d2_plugin.recordings.recording import Recording, Source
 Shown = Callable[[str, int], "np.ndarray | None"]
 
 
-class _Showing(Source):
-    def __init__(self, source: Source, instead: dict[str, Shown]) -> None:
-        self.source, self.instead = source, instead
-
-    def image(self, camera: str, frame: int) -> np.ndarray:
-        return self.instead.get("image", self.source.image)(camera, frame)
-
-    def depth(self, camera: str, frame: int) -> np.ndarray | None:
-        return self.instead.get("depth", self.source.depth)(camera, frame)
-
-    def mono(self, camera: str, frame: int) -> np.ndarray | None:
-        return self.instead.get("mono", self.source.mono)(camera, frame)
+MAPS = ("image", "depth", "mono")
 
 
 def showing(recording: Recording, instead: dict[str, Shown], **changes: object) -> Recording:
     """The recording with other images, depth or monocular maps, and other values of `changes`."""
-    return replace(recording, source=_Showing(recording.source, instead), **changes)
+    source = Source()
+    vars(source).update({kind: getattr(recording.source, kind) for kind in MAPS} | instead)
+    return replace(recording, source=source, **changes)
 
 
 def contents(path: Path) -> dict[str, bytes]:

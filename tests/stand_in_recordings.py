@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from prior_cases import MAPS, showing
 
 from d2_plugin.errors import D2Error
 from d2_plugin.recordings import Recording, Source, open_recording
@@ -34,25 +36,15 @@ class Smooth(Source):
         return np.rint(soft + 90 * spot[..., None]).astype(np.uint8)
 
 
-class _Renamed(Source):
-    def __init__(self, recording: Recording, names: dict[str, str]) -> None:
-        self.recording, self.names = recording, names
-
-    def image(self, camera: str, frame: int) -> np.ndarray:
-        return self.recording.image(self.names[camera], frame)
-
-    def depth(self, camera: str, frame: int) -> np.ndarray | None:
-        return self.recording.depth(self.names[camera], frame)
-
-    def mono(self, camera: str, frame: int) -> np.ndarray | None:
-        return self.recording.mono(self.names[camera], frame)
-
-
 def renamed(recording: Recording, names: tuple[str, ...], **changes: object) -> Recording:
     """The recording with other names for its cameras, and other values of `changes` in each."""
     old = dict(zip(names, recording.cameras, strict=True))
     cameras = {name: replace(recording.cameras[was], name=name, **changes) for name, was in old.items()}
-    return replace(recording, cameras=cameras, source=_Renamed(recording, old))
+
+    def of(kind: str) -> Callable[[str, int], np.ndarray | None]:
+        return lambda name, frame: getattr(recording, kind)(old[name], frame)
+
+    return showing(recording, {kind: of(kind) for kind in MAPS}, cameras=cameras)
 
 
 def smooth_recording(names: tuple[str, ...], frames: int = 20, width: int = 96, height: int = 64) -> Recording:

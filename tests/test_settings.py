@@ -1,4 +1,4 @@
-"""One declaration per setting: whatever is wrong is refused in one sentence that names it, whatever is right stays."""
+"""Settings: one declaration each; what is wrong is one sentence that names it, what is right stays, in files too."""
 
 from __future__ import annotations
 
@@ -6,25 +6,31 @@ import importlib
 import json
 import math
 import pkgutil
-from collections.abc import Iterator
-from dataclasses import MISSING, asdict, dataclass, field
+import tomllib
+from collections.abc import Callable, Iterator
+from dataclasses import MISSING, asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args, get_origin
 
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
+from tiny import ALL_HOOKS
 
 import d2_plugin
 from d2_plugin import D2Config
+from d2_plugin.backbones import deform
 from d2_plugin.backbones.deform import DeformSettings
 from d2_plugin.backbones.trainer import TrainSettings
 from d2_plugin.backbones.yang4d import Yang4DSettings
+from d2_plugin.config import DensifyConfig, PruneConfig
 from d2_plugin.errors import D2Error
 from d2_plugin.hooks import HOOKS
+from d2_plugin.priors.settings import PriorSettings
 from d2_plugin.protocol import RasterSettings
+from d2_plugin.runs.settings import RunSettings, check
 from d2_plugin.settings import (
     AtLeastOne,
     Count,
@@ -125,23 +131,6 @@ def test_any_value_is_refused_in_one_sentence_with_its_name_or_kept_and_python_i
         assert not isinstance(number, (int, float)) or isinstance(number, bool) or limits.holds(number)
 
 
-@given(
-    st.builds(
-        Example,
-        start=st.integers(0, 10**6),
-        kind=st.sampled_from(["relative", "metric"]),
-        weight=st.floats(1e-9, 1e9),
-        stop=st.none() | st.integers(0, 9),
-        tau=st.just("auto") | st.floats(1e-9, 1e9),
-        levels=st.lists(st.integers(1, 99), max_size=4),
-        bounds=st.none() | st.tuples(st.floats(1e-3, 1), st.floats(1, 9)),
-        maybe=st.none() | st.builds(Inner, part=st.floats(0, 1)),
-    )
-)
-def test_settings_survive_json(settings: Example) -> None:
-    assert Example.from_dict(json.loads(json.dumps(asdict(settings)))) == settings
-
-
 def test_whole_numbers_become_floats_and_lists_tuples() -> None:
     made = Example(weight=2, levels=[3, 4], bounds=[1, 2], folder="a/b")
     assert (made.weight, made.levels, made.bounds, made.folder) == (2.0, (3, 4), (1.0, 2.0), Path("a/b"))
@@ -187,17 +176,6 @@ def test_a_setting_without_a_default_is_asked_for() -> None:
     with pytest.raises(D2Error, match="recording must have name: add what is missing"):
         Needy.from_dict({"count": 1}, "recording")
     assert declared(Needy)[0].default is MISSING
-
-
-def test_help_range_unit_and_place_are_found() -> None:
-    assert [name for name, setting in NAMES.items() if setting.positional] == ["name"]
-    assert NAMES["start"].help == "The first step of all."
-    assert NAMES["kind"].help == "What the network returns."
-    assert NAMES["inner"].help == "A table inside."
-    assert NAMES["reach"].range.unit == "m"
-    assert NAMES["start"].range == Range(0, unit="steps")
-    assert NAMES["levels"].default == (1, 2)
-    assert next(iter(NAMES)) == "start", "a base's settings come first"
 
 
 def every_settings_class() -> list[type[Settings]]:
@@ -261,3 +239,83 @@ def test_no_number_takes_what_is_none_and_every_default_is_allowed_in_files() ->
 )
 def test_every_setting_of_hooks_and_backbones_has_help(kind: type[Settings]) -> None:
     assert [setting.name for setting in declared(kind) if not setting.help] == []
+
+
+RUN = RunSettings("room", ("a",))
+
+
+def run(table: dict[str, Any]) -> RunSettings:
+    return check(replace(RUN, **table))
+
+
+@pytest.mark.parametrize(
+    ("read", "table", "sentence"),
+    [
+        (D2Config.from_dict, {"view_per_evaluation": 3}, r"unknown setting 'view_per.*did you mean 'views_per_eval"),
+        (D2Config.from_dict, {"version": 2}, r"the configuration has settings of version 2, and this d2-4dgs reads"),
+        (deform.settings_from, {"hexplane": {"resolutions": []}}, r"resolutions has 0 levels: give one to eight"),
+        (deform.settings_from, {"hexplane": {"resolutions": [1] * 9}}, r"resolutions has 9 levels: give one to eight"),
+        (deform.settings_from, {"hexplane": {"instants": 1001}}, r"instants must be .* at most 1000"),
+        (deform.settings_from, {"mlp": {"width": 8192}}, r"width must be .* at most 1024"),
+        (deform.settings_from, {"field": "hexplan"}, r"unknown backbone\.field 'hexplan': have hexplane, mlp; did you"),
+        (PriorSettings.from_dict, {"depth_range": [9.0, 1.0]}, "0 < near < far"),
+        (PriorSettings.from_dict, {"stereo": {"min_angle": 60.0}}, "min_angle must be below max_angle, got 60 and 60"),
+        (run, {"mono_onnx": "net.onnx"}, r"--mono-onnx needs --mono-kind"),
+        (run, {"hooks": ("prun",)}, r"unknown hook 'prun'.*did you mean 'prune'"),
+        (run, {"overrides": {"plan": {"temporl": True}}}, r"unknown decision of plan 'temporl'.*did you mean 'tempor"),
+        (run, {"overrides": {"d2": {"densify": 5}}}, r"d2\.densify is a table of its own"),
+        (run, {"overrides": {"prunes": {}}}, r"unknown table 'prunes'.*did you mean 'prune'"),
+    ],
+)
+def test_what_cannot_be_meant_is_one_sentence(read: Callable, table: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(D2Error, match=sentence) as refusal:
+        read(table)
+    assert "\n" not in str(refusal.value)
+
+
+@settings(max_examples=40)
+@given(
+    st.builds(
+        D2Config,
+        prior=st.none() | st.text(min_size=1),
+        densify=st.none()
+        | st.builds(DensifyConfig, stop=st.none() | st.integers(0, 9), tau_u_mono=st.just(math.inf) | st.floats(0, 9)),
+        prune=st.none() | st.builds(PruneConfig, stop=st.none() | st.integers(0, 9), tau_p=st.floats(0, 1)),
+        seed=st.integers(0, 2**63 - 1),
+    )
+)
+def test_any_configuration_survives_toml(config: D2Config) -> None:
+    assert D2Config.from_dict(tomllib.loads(config.to_toml())) == config
+
+
+def test_a_file_says_its_version_and_paths_are_its_folders(tmp_path: Path) -> None:
+    path = tmp_path / "d2.toml"
+    text = ALL_HOOKS.to_toml()
+    assert tomllib.loads(text)["version"] == 1
+    path.write_text(text.replace("version = 1", ""))
+    assert D2Config.from_toml(path) == ALL_HOOKS
+    path.write_text(text.replace("version = 1", "version = 7"))
+    with pytest.raises(D2Error, match=r"d2\.toml has settings of version 7, and this d2-4dgs reads version 1: use the"):
+        D2Config.from_toml(path)
+    path.write_text('prior = "maps"\n[densify]\n')
+    assert D2Config.from_toml(path).prior == str(tmp_path / "maps")
+    path.write_text(replace(ALL_HOOKS, prior="/somewhere").to_toml())
+    assert D2Config.from_toml(path).prior == "/somewhere"
+    path.write_text("[densify\n")
+    with pytest.raises(D2Error, match="not valid TOML"):
+        D2Config.from_toml(path)
+
+
+def test_a_run_survives_its_file_and_names_another_version() -> None:
+    settings = run({"frames": (0, 2), "overrides": {"prune": {"tau_p": 0.5}}})
+    table = settings.as_table()
+    assert table["version"] == 1
+    assert RunSettings.from_table(table, "run.json") == settings
+    assert RunSettings.from_table({k: v for k, v in table.items() if k != "version"}, "run.json") == settings
+    with pytest.raises(D2Error, match=r"run\.json has settings of version 9"):
+        RunSettings.from_table(table | {"version": 9}, "run.json")
+
+
+@pytest.mark.parametrize("settings", [PriorSettings(), PriorSettings.paper(depth_range=(1, 9))])
+def test_a_record_of_the_settings_of_priors_gives_them_back(settings: PriorSettings) -> None:
+    assert PriorSettings.from_dict(json.loads(json.dumps(asdict(settings)))) == settings

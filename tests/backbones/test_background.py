@@ -1,8 +1,9 @@
-"""The colour at infinity: the same from every camera, begun with the images, saved with the model, no surface."""
+"""The colour at infinity, and cameras of different exposure: begun with the images, learnt, saved with the model."""
 
 from __future__ import annotations
 
 import copy
+import io
 import math
 from dataclasses import replace
 
@@ -17,11 +18,14 @@ from tiny import (
     make_model,
     make_trainer,
     make_views,
+    parameters,
+    same,
 )
 from tiny import parameters as of_the_gaussians
 from torch import Tensor
 
 from d2_plugin.backbones import background as module
+from d2_plugin.backbones.appearance import Appearance
 from d2_plugin.backbones.background import Background
 from d2_plugin.backbones.model import SplatSettings
 from d2_plugin.backbones.trainer import Trainer
@@ -35,14 +39,14 @@ def backbone(request: pytest.FixtureRequest) -> str:
     return request.param
 
 
-def parameters(trainer: Trainer) -> list[Tensor]:
+def with_sky(trainer: Trainer) -> list[Tensor]:
     sky = trainer.model.background
     own = [] if sky is None else [sky.constant.detach().clone(), sky.harmonics.detach().clone()]
     return [*of_the_gaussians(trainer).values(), *own]
 
 
-def same(a: Trainer, b: Trainer) -> bool:
-    return all(torch.equal(*pair) for pair in zip(parameters(a), parameters(b), strict=True))
+def same_with_sky(a: Trainer, b: Trainer) -> bool:
+    return all(torch.equal(*pair) for pair in zip(with_sky(a), with_sky(b), strict=True))
 
 
 def some_sky(seed: int = 0) -> Background:
@@ -95,7 +99,7 @@ class TestState:
             second = make_trainer(ALL_HOOKS, iterations=6, backbone=backbone, background=background, seed=99)
             second.load_state_dict(copy.deepcopy(first.state_dict()))
             second.run()
-            assert same(whole, second)
+            assert same_with_sky(whole, second)
 
     def test_a_checkpoint_without_one_loads_into_a_model_that_has_one(self, backbone: str) -> None:
         bare, other = (make_model(backbone=backbone, background=on) for on in (False, True))
@@ -228,3 +232,109 @@ class TestStart:
 
     def test_nothing_to_look_at_leaves_it_grey(self) -> None:
         assert not self.started([], []).constant.any()
+
+
+GAINS = {"cam0": 0.8, "cam1": 1.0, "cam2": 1.2}
+
+
+class Exposed(TinyFrames):
+    """The tiny scene with a gain for each camera."""
+
+    def image(self, index: int) -> torch.Tensor:
+        return super().image(index) * GAINS[self.views[index].camera]
+
+
+def make_exposed(backbone: str = "yang4d", **settings: object) -> Trainer:
+    trainer = make_trainer(iterations=400, backbone=backbone, **settings)
+    trainer.frames = Exposed()
+    return trainer
+
+
+def test_gains_are_learnt_and_a_camera_that_did_not_train_sees_the_mean() -> None:
+    found = {}
+    for appearance in (False, True):
+        trainer = make_exposed(appearance=appearance, temporal=False)
+        trainer.run()
+        found[appearance] = trainer.model
+    changes = torch.stack([found[True].appearance.change(camera).detach() for camera in GAINS])
+    assert changes.mean(0).abs().max() < 1e-6
+    gray = (0.5 + changes[:, :, :3].sum(-1) * 0.5 + changes[:, :, 3]).mean(-1)  # what a gray of .5 looks like
+    assert (gray[2] - gray[0]).item() == pytest.approx(0.2, abs=0.07)
+    truth = TinyFrames().image(0)
+    errors = {}
+    for appearance, model in found.items():
+        with torch.no_grad():
+            view = make_views()[0]
+            view = view.__class__(**(vars(view) | {"camera": "held out"}))
+            errors[appearance] = (model.render(view).color - truth).abs().mean().item()
+    assert errors[True] < 0.7 * errors[False], "the colours of its neighbours' exposures"
+
+
+def test_a_camera_that_never_trained_changes_nothing() -> None:
+    appearance, render = Appearance(torch.device("cpu")), Render(*torch.rand(3, 4, 5, 3))
+    with torch.no_grad():
+        assert appearance.seen_by("held out", render) is render
+    assert not appearance.changes
+
+
+@pytest.mark.parametrize("backbone", BACKBONES)
+def test_a_resumed_run_is_bitwise_the_uninterrupted_one(backbone: str) -> None:
+    whole, first = (make_trainer(ALL_HOOKS, backbone=backbone, appearance=True) for _ in range(2))
+    whole.run()
+    first.run(until=17)
+    buffer = io.BytesIO()
+    torch.save(first.state_dict(), buffer)
+    buffer.seek(0)
+    second = make_trainer(ALL_HOOKS, backbone=backbone, seed=99)  # the checkpoint says that there is an appearance
+    second.load_state_dict(torch.load(buffer, weights_only=True))
+    second.run()
+    assert same(parameters(whole), parameters(second))
+    for camera in ("cam0", "cam1", "cam2"):
+        assert torch.equal(whole.model.appearance.change(camera), second.model.appearance.change(camera))
+    assert whole.model.appearance.change("cam0").abs().max() > 0
+
+
+MEASURED = {"a": (1.2, 1.1, 1.0), "b": (0.8, 0.9, 1.0), "held": (1.4, 1.0, 0.7)}
+
+
+def grey() -> Render:
+    return Render(torch.full((2, 2, 3), 0.5), torch.ones(2, 2), torch.ones(2, 2))
+
+
+def started() -> Appearance:
+    appearance = Appearance(torch.device("cpu"))
+    appearance.start_from(MEASURED, ("a", "b"))
+    return appearance
+
+
+@pytest.mark.parametrize("camera", MEASURED)
+def test_each_camera_sees_its_gain_before_the_first_step(camera: str) -> None:
+    with torch.no_grad():
+        seen = started().seen_by(camera, grey()).color
+    torch.testing.assert_close(seen[0, 0], 0.5 * torch.tensor(MEASURED[camera]))
+
+
+def test_only_training_cameras_learn() -> None:
+    appearance = started()
+    for camera in MEASURED:
+        appearance.seen_by(camera, grey()).color.sum().backward() if camera != "held" else None
+    assert set(appearance.changes) == {"a", "b"}
+    appearance.seen_by("held", grey())
+    assert set(appearance.changes) == {"a", "b"}
+
+
+def test_nothing_begins_where_a_training_camera_has_no_gain() -> None:
+    appearance = Appearance(torch.device("cpu"))
+    appearance.start_from({"a": (1.2, 1.0, 1.0)}, ("a", "b"))
+    assert not appearance.changes
+    assert not appearance.measured
+
+
+def test_measured_changes_are_saved_with_those_that_learn() -> None:
+    appearance, again = started(), Appearance(torch.device("cpu"))
+    appearance.seen_by("a", grey()).color.sum().backward()
+    appearance.optimize()
+    again.load_state_dict(appearance.state_dict())
+    for camera in MEASURED:
+        with torch.no_grad():
+            assert torch.equal(again.seen_by(camera, grey()).color, appearance.seen_by(camera, grey()).color)

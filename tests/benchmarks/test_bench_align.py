@@ -1,25 +1,31 @@
-"""`d2 bench align`: the peers solve what they claim to solve, errors are what they are called, results are written."""
+"""`d2 bench align`, `raster` and `stability`: peers solve what they claim, scenes are what they are called."""
 
 from __future__ import annotations
 
+import json
+import math
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from benchmarks.align import AlignBench, run, tables
 from benchmarks.align_measure import (
     TRUE_LINE,
     AlignMethod,
     align_problem,
-    measure,
     methods,
     optimum,
 )
-from d2_plugin.runs.rows import read_rows
-
-SMALL = {"anchors": (60, 300), "outliers": (0.0, 0.4), "seeds": 1, "seconds": 0.0}
+from benchmarks.raster_scenes import Scene, load_scene
+from benchmarks.stability.gaussians import difference, largest, random_rotation, random_scene
+from benchmarks.stability.sweep import SWEEPS, measure, run_sweeps
+from benchmarks.stability.sweep import tables as sweep_tables
+from d2_plugin.errors import D2Error
+from d2_plugin.rasterizer import RasterSettings, reference
+from d2_plugin.runs.rows import Row, read_rows
 
 
 @pytest.mark.parametrize("kind", ["relative", "metric"])
@@ -44,34 +50,6 @@ def test_no_line_beats_the_optimum_that_gaps_are_measured_from() -> None:
             assert problem.objective(tuple(line), residual) >= best
 
 
-def test_a_tighter_gap_is_closer_to_the_optimum_and_is_kept() -> None:
-    problems = [align_problem("relative", 2000, 0.4, seed) for seed in range(3)]
-    settings = {method.setting: method for method in methods() if method.name == "certified"}
-    for residual in ("relative", "absolute"):
-        gaps = {
-            tolerance: measure(settings[f"{residual}, gap {tolerance:g}"], problems, 0).gap
-            for tolerance in (1e-2, 1e-6, 1e-10)
-        }
-        assert all(gap <= tolerance for tolerance, gap in gaps.items())
-        assert gaps[1e-10] <= gaps[1e-2]
-
-
-def test_least_squares_pays_for_wrong_anchors_and_the_certified_fit_little() -> None:
-    problems = [align_problem("metric", 5000, 0.2, seed) for seed in range(3)]
-    errors = {(m.name, m.setting): measure(m, problems, 0).depth_error for m in methods()}
-    assert errors["certified", "relative, gap 1e-10"] < 0.01 < 0.05 < errors["least squares", "closed form"]
-
-
-def test_bench_adds_rows_and_prints_their_tables(tmp_path: Path) -> None:
-    told = run(AlignBench(**SMALL, methods=("certified", "RANSAC"), output=tmp_path / "rows.jsonl"))
-    rows = read_rows([tmp_path / "rows.jsonl"])
-    assert len(rows) == 2 * 2 * 2 * 8
-    assert all(row["kind"] == "alignment" and row["error"] >= 0 and row["seconds"] > 0 for row in rows)
-    assert rows[0]["case"] == "relative map, 60 anchors, 0% wrong"
-    assert "| certified | relative, gap 1e-10 |" in told
-    assert rows[0]["command"].startswith("d2 bench align --anchors 60,300 --outliers 0,0.4")
-
-
 def test_a_refusal_is_counted_and_no_error_is_made_up_for_it(tmp_path: Path) -> None:
     run(AlignBench((20, 300), (0.0,), ("align()",), 1, 0.0, output=tmp_path / "rows.jsonl"))
     rows = read_rows([tmp_path / "rows.jsonl"])
@@ -79,3 +57,75 @@ def test_a_refusal_is_counted_and_no_error_is_made_up_for_it(tmp_path: Path) -> 
     assert {row["anchors"] for row in refused} == {20}
     assert all("too few pixels" in row["failed"] and row["error"] is None for row in refused)
     assert "(1 of 2 refused)" in str(tables(rows))
+
+
+def test_synthetic_gaussians_have_the_radius_and_the_frustum_they_are_described_with():
+    made = load_scene("synth:4000", 640, 360)
+    scene = Scene(*(part.double() for part in made[:5]), made.view)
+    screen = reference.project(scene.splats(), scene.view, RasterSettings())
+    x, y, slope = screen.variance_x, screen.variance_y, screen.slope
+    middle, covariance = (x + y) / 2, slope * y
+    major = middle + (middle.square() - (x * y - covariance.square())).clamp(min=0).sqrt()
+    assert (3 * major.sqrt()).mean().item() == pytest.approx(4.0, rel=0.02)
+    inside = ((screen.centers >= 0) & (screen.centers <= torch.tensor([640, 360]))).all(1)
+    assert inside.double().mean().item() == pytest.approx(1 / 1.1**2, abs=0.02)
+    assert scene.means[:, 2].min() >= 2
+    assert scene.means[:, 2].max() <= 20
+
+
+def test_the_garden_is_cropped_as_gsplat_does(shared_data):
+    scene = load_scene("garden", 640, 360, shared_data("test_garden.npz"))
+    assert len(scene.means) == 111_785
+    assert scene.means.abs().max() <= 2
+    assert reference.visible(scene.splats(), scene.colors, scene.view, RasterSettings()).numel() > 50_000
+
+
+FLOAT32_ENDS = {"world offset": 100.0}
+"""Beyond this float32 cannot hold the scene, which the report shows as a gap."""
+
+
+@pytest.fixture(scope="module")
+def rows() -> list[Row]:
+    return run_sweeps()
+
+
+def test_nothing_fails_and_only_what_float32_cannot_hold_is_a_gap(rows: list[Row]) -> None:
+    assert [row for row in rows if row["verdict"] == "failure"] == []
+    for row in (row for row in rows if row["verdict"] == "gap"):
+        assert row["method"] == "float32"
+        assert row["value"] > FLOAT32_ENDS[row["case"]]
+
+
+def test_what_float32_cannot_hold_is_told_rather_than_clamped(rows: list[Row]) -> None:
+    far = [row for row in rows if (row["case"], row["method"], row["value"]) == ("world offset", "float32", 1e6)]
+    assert [row["verdict"] for row in far] == ["gap"]
+    assert any(row[:4] == ("world offset", "float32", "1e+06", "gap") for row in sweep_tables(rows)[2][1].rows)
+
+
+def test_a_point_that_is_refused_or_not_finite_is_a_failure_and_one_above_its_limit_a_gap() -> None:
+    def refuses(value: float, dtype: torch.dtype) -> float:
+        raise D2Error("no such thing")
+
+    sweep = SWEEPS["depth"]
+    assert measure(replace(sweep, measure=refuses), 1.0, "float64")["failed"] == "refused: no such thing"
+    for error, verdict in ((math.nan, "failure"), (math.inf, "failure"), (1.0, "gap"), (0.0, "ok")):
+        row = measure(replace(sweep, measure=lambda value, dtype, e=error: e), 1.0, "float64")
+        assert row["verdict"] == verdict
+        assert json.dumps(row, allow_nan=False)
+
+
+def test_a_nan_anywhere_is_not_lost_among_smaller_errors() -> None:
+    scene = random_scene()
+    image = scene.render(torch.float64)
+    for part in image._fields[:3]:
+        broken = image._replace(**{part: getattr(image, part) * torch.full((), math.nan, dtype=torch.float64)})
+        assert math.isnan(difference(broken, image))
+    assert math.isnan(largest(0.1, math.nan))
+    assert math.isnan(largest(math.nan, 0.1))
+
+
+def test_a_scene_that_is_another_one_is_seen_to_differ() -> None:
+    scene = random_scene()
+    image = scene.render(torch.float64)
+    assert difference(scene.turned(random_rotation(3)).render(torch.float64), image) < 1e-12
+    assert difference(scene._replace(means=scene.means + 1e-3).render(torch.float64), image) > 1e-4

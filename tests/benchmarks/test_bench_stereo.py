@@ -1,17 +1,29 @@
-"""`d2 bench stereo`: scores are what they are called, and results are written."""
+"""`d2 bench stereo`, `priors` and `never-worse`: scores are what they are called, maps are spoiled as said."""
 
 from __future__ import annotations
 
+import shutil
+import xml.etree.ElementTree as ET
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from benchmarks.stereo import StereoBench, run, tables
+from benchmarks.never_worse.maps import SPOILED, Spoiled, spoiled_recording
+from benchmarks.priors import Case, PriorsBench, cases, rows_of, run
+from benchmarks.priors_section import DIAGONAL, priors
+from benchmarks.stereo import tables
 from benchmarks.stereo_measure import VARIANTS, measure, score
 from benchmarks.stereo_rigs import Rig, textured_rig
 from d2_plugin.errors import D2Error
-from d2_plugin.runs.rows import read_rows
+from d2_plugin.priors.declared_error import NORMAL_SHARE, DeclaredErrors, frames_with_truth, reliability_curve
+from d2_plugin.priors.settings import PriorSettings
+from d2_plugin.recordings import open_recording
+from d2_plugin.recordings.export.folder import save_recording
+from d2_plugin.recordings.synthetic.room import synthetic_recording
+from d2_plugin.runs.report.report import make_report
+from d2_plugin.runs.rows import Row, read_rows
 
 pytest.importorskip("cv2")
 
@@ -62,13 +74,145 @@ def test_a_setting_that_fails_on_a_rig_says_why_and_counts_as_nothing(
     assert means.rows[0][:3] == ("patchmatch", "2 sources", f"{working['completeness'] / 2:.3f}")
 
 
-def test_bench_adds_rows_and_prints_their_tables(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("benchmarks.stereo._set_threads", lambda count: None)
-    path = tmp_path / "rows.jsonl"
-    told = run(StereoBench(rigs=("synthetic2",), width=96, defaults_only=True, output=path))
-    assert "| synthetic2 | 2 | 96x54 | patchmatch | default |" in told
-    rows = read_rows([path])
-    assert [(row["method"], row["rig"], row["width"]) for row in rows] == [
-        ("patchmatch", "synthetic2", 96),
-    ]
-    assert all(row["kind"] == "stereo" and row["error"] == 1 - row["f1"] and row["cpu"] > 0 for row in rows)
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two cameras, three frames, true depth at the first and the last."""
+    room = synthetic_recording(2, held_out=0, frames=3, width=96, height=54)
+    path = save_recording(room, tmp_path_factory.mktemp("recordings") / "den")
+    for depth in path.glob("depth/*/00001.*"):
+        depth.unlink()
+    return path
+
+
+@pytest.fixture(scope="module")
+def measured(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, list[Row]]:
+    output = tmp_path_factory.mktemp("bench") / "runs.jsonl"
+    told = run(PriorsBench(rigs=("synthetic4",), width=96, frames=(0,), output=output))
+    return told, read_rows([output])
+
+
+@pytest.mark.parametrize("times", [0.5, 1.0, 2.0])
+def test_the_curve_of_known_errors_lies_as_many_times_above_the_diagonal_as_they_are_too_large(times: float) -> None:
+    rng = np.random.default_rng(0)
+    sigma = 10 ** rng.uniform(-3, -1, 200_000)
+    curve = reliability_curve(np.abs(times * sigma * rng.standard_normal(sigma.size)), sigma)
+    assert len(curve) == 8, "two decades at four bins"
+    for point in curve:
+        assert point.error == pytest.approx(times * point.sigma, rel=0.05)
+    assert [point.sigma for point in curve] == sorted(point.sigma for point in curve)
+    assert sum(point.pixels for point in curve) == sigma.size
+
+
+def test_bins_of_a_few_pixels_and_a_sigma_of_zero_have_no_mark() -> None:
+    few, rare = np.full(29, 0.02), np.concatenate([np.full(10_000, 0.02), np.full(50, 0.5)])
+    assert reliability_curve(few, few) == ()
+    assert [point.pixels for point in reliability_curve(rare, rare)] == [10_000]
+    assert reliability_curve(np.zeros(100), np.zeros(100)) == ()
+    assert reliability_curve(np.zeros(0), np.zeros(0)) == ()
+
+
+def test_a_rendered_rig_is_measured_without_any_data(measured: tuple[str, list[Row]]) -> None:
+    told, rows = measured
+    assert "synthetic4, 4 views" in told
+    assert "held against the true depth of 4 views" in told
+    assert {row["kind"] for row in rows} == {"priors"}
+    assert [row["method"] for row in rows] == ["verified", "agreed", "mono only", "far", "motion"]
+    for row in rows[:3]:
+        assert row["error"] == pytest.approx(abs(row["within"] - NORMAL_SHARE))
+        assert 0 < row["share"] < 1
+        assert row["seconds"] > 0
+        assert row["mono_emulated"]
+        assert all(len(point) == 3 for point in row["curve"])
+    motion = rows[4]
+    assert 0.2 < motion["motion_right"] < motion["motion_known"] < 1
+    assert motion["motion_psnr"] > 15
+    assert 0 < motion["motion_within"] < motion["motion_within_two"] < 1
+    assert rows[0]["command"] == ("d2 bench priors --rigs synthetic4 --frames 0 --width 96 --output runs.jsonl"), (
+        "no folder of this machine"
+    )
+
+
+def test_what_cannot_be_compared_is_refused_in_a_sentence(folder: Path, tmp_path: Path) -> None:
+    blind = shutil.copytree(folder, tmp_path / "blind")
+    shutil.rmtree(blind / "depth")
+    with pytest.raises(D2Error, match=r"^blind has no true depth, .*: name recordings that have one$"):
+        cases(PriorsBench((str(blind),)))
+    with pytest.raises(D2Error, match="den has no true depth at frame 1: choose --frames from frames 0, 2"):
+        cases(PriorsBench((str(folder),), frames=(1,)))
+    with pytest.raises(D2Error, match="unknown camera 'train9'"):
+        cases(PriorsBench((str(folder),), train_cameras=("train9",)))
+    with pytest.raises(D2Error, match="unknown rig 'synthetc2'.*did you mean 'synthetic2'"):
+        cases(PriorsBench(rigs=("synthetc2",)))
+
+
+def test_frames_with_truth_are_those_of_any_of_the_cameras(folder: Path) -> None:
+    recording = cases(PriorsBench((str(folder),)))[0].recording
+    assert frames_with_truth(recording, ["train0"]) == [0, 2]
+    assert frames_with_truth(recording, []) == []
+    long = synthetic_recording(1, held_out=0, frames=9, width=16, height=9)
+    assert frames_with_truth(long, ["train0"], most=3) == [0, 4, 8], "spread over the recording"
+    assert frames_with_truth(long, ["train0"], most=9) == list(range(9))
+
+
+def marks(svg: str) -> list[ET.Element]:
+    return [e for e in ET.fromstring(svg).iter() if len(e) and e[0].tag.endswith("title") and "pixels" in e[0].text]
+
+
+def test_the_diagram_has_a_mark_per_bin_and_the_diagonal(measured: tuple[str, list[Row]], tmp_path: Path) -> None:
+    _, rows = measured
+    make_report(rows, tmp_path, builders={"priors": priors})
+    svg, text = (tmp_path / "priors.svg").read_text(), (tmp_path / "report.md").read_text()
+    assert len(marks(svg)) == sum(len(row["curve"]) for row in rows[:3]) > 0
+    assert DIAGONAL in svg
+    assert "true error, 68 % quantile" in svg
+    assert "| synthetic4, 4 views | mono only |" in text
+    assert "emulated, not predicted" in text
+    assert "What moves: scene flow, and what lies between two instants" in text
+
+
+def test_a_recording_without_any_label_has_a_row_and_no_curve() -> None:
+    recording = synthetic_recording(1, held_out=0, frames=1, width=32, height=18)
+    rows = rows_of(Case("sky, 1 views", recording, ("train0",)), DeclaredErrors(1, {}, 0.9, 0.01), 1.0)
+    assert [(row["method"], row["error"]) for row in rows] == [("far", 0.01)]
+    section = priors(rows)
+    assert "nothing was measured" in section.figures["priors"]
+    assert [title for title, _ in section.tables] == ["Far pixels"], "every recording has a row, also without labels"
+    assert section.tables[0][1].rows == (("sky, 1 views", "90.0%", "1.0%"),)
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    recording = synthetic_recording(2, held_out=1, frames=2, width=96, height=54, arc_degrees=15)
+    return save_recording(recording, tmp_path_factory.mktemp("recordings") / "room")
+
+
+@pytest.mark.parametrize("kind", SPOILED)
+def test_a_spoiled_recording_differs_in_its_maps_alone(room: Path, tmp_path: Path, kind: Spoiled) -> None:
+    before = open_recording(room)
+    cameras = list(before.cameras)[:2]
+    after = open_recording(spoiled_recording(room, cameras, None, kind, tmp_path, PriorSettings()))
+    assert after.name == before.name
+    assert after.mono_kind == before.mono_kind
+    assert after.mono_emulated == before.mono_emulated
+    for camera in cameras:
+        for frame in before.frames:
+            assert np.array_equal(after.image(camera, frame), before.image(camera, frame))
+            assert np.array_equal(after.depth(camera, frame), before.depth(camera, frame))
+            assert not np.array_equal(after.mono(camera, frame), before.mono(camera, frame))
+    assert after.mono(list(before.cameras)[2], before.frames[0]) is None, "a camera that does not train needs no map"
+
+
+def test_each_map_is_what_its_name_says(room: Path, tmp_path: Path) -> None:
+    before = open_recording(room)
+    cameras = list(before.cameras)[:2]
+
+    def spoiled(kind: Spoiled, frames: tuple[int, ...] | None = None, folder: str = "all") -> np.ndarray:
+        path = spoiled_recording(room, cameras, frames, kind, tmp_path / folder, PriorSettings())
+        return open_recording(path).mono(cameras[0], 0)
+
+    assert np.ptp(spoiled("constant")) == 0
+    assert np.std(np.diff(spoiled("noise", folder="noise"))) > 2 * np.std(np.diff(spoiled("smooth", folder="smooth")))
+    other = spoiled("other", folder="other")
+    assert np.allclose(other, before.mono(cameras[0], before.frames[1]), atol=1e-2)
+    alone = spoiled("other", (0,), "one frame")
+    assert np.allclose(alone, before.mono(cameras[1], 0), atol=1e-2), "with one frame it is another camera's"

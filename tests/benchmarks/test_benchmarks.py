@@ -11,12 +11,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from benchmarks import memory, scaling, training_step
+from benchmarks import memory, scaling
 from benchmarks.__main__ import main
 from benchmarks.memory import in_fresh_process
 from benchmarks.report import EVERY
 from benchmarks.work_precision import means, pareto_front, work_precision
-from d2_plugin.errors import D2Error
 from d2_plugin.runs.report.report import make_report
 from d2_plugin.runs.rows import Row, make_row, read_rows
 
@@ -49,10 +48,31 @@ def test_a_place_for_rows_that_cannot_be_is_said_before_anything_is_measured(
     assert (tmp_path / "thesis.tex").read_text() == "mine"
 
 
-def test_a_step_too_small_to_be_measured_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(training_step, "timed", lambda *_: {training_step.RASTER: {"cpu_ms": 0.0}})
-    with pytest.raises(D2Error, match="took no CPU time that can be measured: give more --gaussians"):
-        training_step.measure(training_step.StepCase(5, 16, 16, 1), 0.0, memory=False)
+@pytest.mark.parametrize(
+    ("words", "rows", "shown"),
+    [
+        ("align --anchors 60,300 --outliers 0,0.4 --seeds 1 --seconds 0 --methods certified,RANSAC", 64, "gap 1e-10"),
+        ("raster --scenes synth:30,synth:60 --sizes 24x16 --seconds 0 --no-memory", 4, "| d2 | synth:60 | 24x16 |"),
+        ("stereo --rigs synthetic2 --width 96 --makers patchmatch --defaults-only", 1, "| synthetic2 | 2 | 96x54 |"),
+        ("scaling --frames 1,2 --width 96 --iterations 2", 4, "frames^"),
+        ("stability --sweeps epsilon", 16, "| epsilon | float32 | smoothing over median depth: 1e-08 .. 0.1 | 8 | 8 |"),
+    ],
+)
+def test_a_part_adds_rows_of_what_it_measured_and_prints_their_tables(
+    words: str,
+    rows: int,
+    shown: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("benchmarks.stereo._set_threads", lambda count: None)
+    monkeypatch.setattr(scaling, "in_fresh_process", lambda work, *given: memory.Measured(work(*given), 1.0))
+    assert main([*words.split(), "--output", str(tmp_path / "rows.jsonl")]) == 0
+    assert shown in capsys.readouterr().out
+    found = read_rows([tmp_path / "rows.jsonl"])
+    assert len(found) == rows
+    assert all(row["failed"] is None and row["command"].startswith(f"d2 bench {words.split()[0]}") for row in found)
 
 
 # ---------------------------------------------------------------- the page
@@ -92,17 +112,6 @@ def test_means_over_cases_are_geometric_and_failures_keep_a_setting_off_the_fron
 
 
 # ---------------------------------------------------------------- growth and memory
-
-
-def test_scaling_adds_rows_of_time_and_memory_per_length(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(scaling, "in_fresh_process", lambda work, *given: memory.Measured(work(*given), 1.0))
-    path = tmp_path / "runs.jsonl"
-    told = scaling.run(scaling.ScalingBench(frames=(1, 2), width=96, iterations=2, output=path))
-    rows = read_rows([path])
-    assert [(row["method"], row["frames"]) for row in rows] == [(p, n) for n in (1, 2) for p in ("priors", "training")]
-    assert all(row["seconds"] > 0 for row in rows)
-    assert "frames^" in told
-    assert rows[0]["command"] == "d2 bench scaling --frames 1,2 --width 96 --iterations 2 --output runs.jsonl"
 
 
 @LINUX

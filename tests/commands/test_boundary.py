@@ -98,30 +98,29 @@ class TestWords:
         ("words", "says"),
         [
             (["--seed", "-1"], "--seed must be at least 0"),
-            (["--seed", str(2**64)], "--seed must be at least 0 and at most"),
             (["--seed", "9" * 5000], "--seed must be"),
             (["--frames", "0:3000000000"], "1000000 numbers at most"),
             (["--frames", ",".join(["0:999999"] * 1000)], "1000000 numbers at most"),
             (["--background-weight", "2"], "--background-weight must be at least 0 and at most 1"),
-            (["--background-weight", "nan"], "--background-weight must be"),
             (["--config", ""], "--config must be a path, got ''"),
             (["--output="], "--output must be a path, got ''"),
             (["--frames", "0:10:0"], "give whole numbers"),
-            (["--frames", "5:1"], "give whole numbers"),
             (["--hooks", "all,none"], "--hooks says 'all,none': all stands alone"),
             (["--hooks", ","], "--hooks names no hook"),
+            (["--hooks", "densify,depthloss"], "did you mean 'depth_loss'?"),
+            (["--backbone", "yang"], "did you mean 'yang4d'?"),
+            (["--train-cameras", ","], "no training camera"),
+            (["--train-cameras", "cam00,cma01"], "did you mean 'cam01'?"),
+            (["--mono-onnx", "net.onnx"], "--mono-kind"),
+            (["--device", "cdua"], "cuda"),
             (["--mono-kind", "metrical"], "did you mean 'metric'"),
             (["--budget-per-view", "5"], "did you mean --densify.budget-per-view?"),
             (["--iteratoins", "5"], "did you mean --iterations?"),
             (["--downscale", "60000"], "leaves no pixel"),
             (["--iterations", "9" * 30], "--iterations must be at least 1 and at most 1e+09"),
-            (["--priors.lambda-p", "nan"], "unknown flag"),
             (["--prune.lambda-e", "nan"], "--prune.lambda-e must be"),
-            (["--densify.tau-v", "nan"], "--densify.tau-v must be"),
-            (["--plan.temporal", "maybe"], "--plan.temporal must be"),
             (["--priors.depth-range", "1,2,3"], "--priors.depth-range must be a list of 2"),
             (["--depth-loss.weight", "1e308"], "--depth-loss.weight must be"),
-            (["--depth-loss.weight", "inf"], "--depth-loss.weight must be"),
         ],
     )
     def test_values_that_cannot_be(
@@ -137,6 +136,8 @@ class TestWords:
             "priors = 5", "backbone = []", "[[densify]]\ncell = 1", "plan = 'x'", "[priors]\nstereo = 3",
             "d2 = 2026-01-01", "[densify]\ncell = 2026-01-01T00:00:00", "[backbone]\nsh_degree = inf",
             "x = " + "[" * 3000, "= 1", "\x00", "[plan]\ntemporal = \"maybe\"", "[priors]\ndepth_range = [1, 2, 3]",
+            "[d2]\ndensify = 5", "[d2]\ndensify = { scale = 1.0 }", "[prune]\ntau_pp = 0.5",
+            "[plan]\nverification = false",
         ],
     )  # fmt: skip
     def test_configurations_that_cannot_be(self, recording: Path, tmp_path: Path, refused: Refused, text: str) -> None:
@@ -176,28 +177,6 @@ class TestPlaces:
         described["cameras"][0]["name"] = name
         (copy / "cameras.json").write_text(json.dumps(described))
         assert "rename it" in refused("plan", str(copy), "--train-cameras", "cam01")
-
-    @pytest.mark.parametrize(
-        ("key", "value"),
-        [
-            *(("fx", focal) for focal in (0, 1e-30, 1e30)),
-            *(("t", place) for place in ([1e30, 0, 0], [1])),
-            *(("R", turn) for turn in ("x", [[0] * 3] * 3)),
-            *(("width", width) for width in (-1, 10**9, 1e300)),
-            ("cx", 1e30),
-        ],
-    )
-    def test_a_calibration_that_cannot_be(self, copy: Path, refused: Refused, key: str, value: object) -> None:
-        described = json.loads((copy / "cameras.json").read_text())
-        described["cameras"][0][key] = value
-        (copy / "cameras.json").write_text(json.dumps(described))
-        assert "cam00" in refused("plan", str(copy), "--train-cameras", "cam00,cam01")
-
-    @pytest.mark.parametrize("fps", [1e-300, 1e300, 0, -1, "30", None])
-    def test_a_frame_rate_that_cannot_be(self, copy: Path, refused: Refused, fps: object) -> None:
-        described = json.loads((copy / "cameras.json").read_text())
-        (copy / "cameras.json").write_text(json.dumps(described | {"fps": fps}))
-        assert "fps" in refused("plan", str(copy), "--train-cameras", "cam00,cam01")
 
     def test_a_depth_map_that_only_evaluation_reads_is_named_before_training(
         self, copy: Path, tmp_path: Path, refused: Refused

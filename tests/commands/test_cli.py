@@ -1,4 +1,4 @@
-"""The `d2` command as a person uses it: one run from recording to score, and one sentence for every mistake."""
+"""The `d2` command as a person uses it: from recording to score, the demo, and one sentence for every mistake."""
 
 from __future__ import annotations
 
@@ -10,16 +10,20 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from oracles.export_files import ReadPage
 
 from d2_plugin.commands.cli import main
-from d2_plugin.errors import D2Error
+from d2_plugin.recordings import open_recording
+from d2_plugin.recordings.export import folder as folder_layout
 from d2_plugin.recordings.export.folder import save_recording
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.runs.run import Run
 from d2_plugin.store.store import PriorStore
+from d2_plugin.viewing import demo
 
 pytest.importorskip("pycolmap", reason="pycolmap is in the `stereo` extra")
 pytest.importorskip("cv2", reason="opencv is in the `image` extra")
+
 
 CAMERAS = "train0,train1,train2"
 
@@ -223,72 +227,12 @@ class TestMistakes:
         assert "holds another run, made with other settings of seed" in message
         assert contents(finished) == before
 
-    @pytest.mark.parametrize("place", ["images", "images/run", "images/train0"])
-    def test_an_output_among_the_images_is_refused(
-        self, recording: Path, capsys: pytest.CaptureFixture[str], place: str
-    ) -> None:
-        before = contents(recording)
-        message = refused(capsys, train(recording, recording / place))
-        assert "where every folder is a camera: choose another place" in message
-        assert contents(recording) == before
-        assert not (recording / "images" / "run").exists()
-
     def test_a_folder_with_other_files_is_left_alone(
         self, recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
         (tmp_path / "notes.txt").write_text("mine")
         assert "is not empty and holds no run" in refused(capsys, train(recording, tmp_path))
         assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
-
-    @pytest.mark.parametrize(
-        ("words", "says"),
-        [
-            (["--hooks", "densify,depthloss"], ["unknown hook 'depthloss'", "did you mean 'depth_loss'?"]),
-            (["--backbone", "yang"], ["unknown backbone 'yang'", "did you mean 'yang4d'?"]),
-            (["--train-cameras", ","], ["no training camera"]),
-            (["--train-cameras", "train0,trian1"], ["unknown camera 'trian1'", "did you mean 'train1'?"]),
-            (["--mono-onnx", "net.onnx"], ["--mono-kind"]),
-            (["--device", "cdua"], ["cuda"]),
-        ],
-    )
-    def test_a_wrong_value_is_answered_with_what_to_write(
-        self, recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], says: list[str]
-    ) -> None:
-        message = refused(capsys, train(recording, tmp_path / "x", *words))
-        assert all(part in message for part in says)
-        assert not (tmp_path / "x").exists()
-
-    def test_a_damaged_prior_is_named_and_that_frame_alone_is_built_again(
-        self, recording: Path, finished: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
-    ) -> None:
-        priors = tmp_path / "priors"
-        shutil.copytree(finished / "priors", priors)
-        array = priors / "priors" / "train1" / "00000.npy"
-        array.write_bytes(array.read_bytes()[:500])
-        written = {path: path.stat().st_mtime_ns for path in (priors / "priors").rglob("*.npy")}
-        with pytest.raises(D2Error, match="camera train1, frame 0 is damaged"):
-            PriorStore.open(priors)
-        assert train(recording, tmp_path / "run", "--priors", str(priors)) == 0
-        assert "train1/00000" in caplog.text
-        assert "is damaged" in caplog.text
-        again = {path for path, time in written.items() if path.stat().st_mtime_ns != time}
-        assert again == {array}
-        assert array.read_bytes() == (finished / "priors" / "priors" / "train1" / "00000.npy").read_bytes()
-
-    def test_wrong_setting_in_the_configuration(
-        self, recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-    ) -> None:
-        config = tmp_path / "d2.toml"
-        config.write_text("[prune]\ntau_pp = 0.5\n")
-        message = refused(capsys, train(recording, tmp_path / "x", "--config", str(config)))
-        assert "unknown setting of prune 'tau_pp'" in message
-        config.write_text("[plan]\nverification = false\n")
-        message = refused(capsys, train(recording, tmp_path / "x", "--config", str(config)))
-        assert "'verification': have appearance, stereo, temporal" in message
-        config.write_text("[backbone]\nsh_degre = 1\n")
-        message = refused(capsys, train(recording, tmp_path / "y", "--hooks", "none", "--config", str(config)))
-        assert "did you mean 'sh_degree'?" in message
-        assert not (tmp_path / "y").exists()
 
 
 def test_instants_between_the_trained_ones_have_their_own_score(
@@ -301,3 +245,40 @@ def test_instants_between_the_trained_ones_have_their_own_score(
     metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert metrics["test"]["psnr_between"] > 0
     assert len(metrics["per_frame"]) == 5
+
+
+class Stopped(BaseException):
+    """Raised where a test ends the demo."""
+
+
+@pytest.fixture(autouse=True)
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The demo on a recording of two frames."""
+    tiny = synthetic_recording(cameras=3, held_out=1, frames=2, width=96, height=54)
+    monkeypatch.setattr(demo, "synthetic_recording", lambda: tiny)
+
+
+def test_a_demo_cut_off_while_it_writes_its_recording_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["demo", "--output", str(tmp_path / "demo"), "--iterations", "4"]
+    write, written = folder_layout.write_png, []
+
+    def cut_off(*arguments: object) -> None:
+        if len(written) == 3:
+            raise Stopped
+        written.append(write(*arguments))  # type: ignore[arg-type]
+
+    with monkeypatch.context() as patch:
+        patch.setattr(folder_layout, "write_png", cut_off)
+        with pytest.raises(Stopped):
+            main(command)
+    assert len(written) == 3
+    assert main(command) == 0
+    out = capsys.readouterr().out
+    assert all(f"| {name}" in out for name in demo.VARIANTS)
+    assert (tmp_path / "demo" / "comparison.png").is_file()
+    assert f"Player: {tmp_path / 'demo' / 'player.html'}" in out
+    assert ReadPage(tmp_path / "demo" / "player.html").header["name"] == "recording"
+    assert len(open_recording(tmp_path / "demo" / "recording").frames) == 2
+    assert not list((tmp_path / "demo").glob("*unfinished*"))

@@ -1,10 +1,12 @@
-"""The slice in the kernel is the slice in torch: values, gradients, edges of the lanes, threads."""
+"""The slice of a 4D Gaussian: golden vectors, the kernel against torch, and where numbers end."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from typing import NamedTuple
 
+import numpy as np
 import pytest
 import torch
 from slice_scenes import AT, CONSTANTS, GOLDEN, random_rows, relative_error
@@ -14,7 +16,16 @@ from torch import Tensor
 from d2_plugin import D2Error
 from d2_plugin.gaussians import native_slice as kernel
 from d2_plugin.gaussians.native_slice import TEMPORAL, native_slice
+from d2_plugin.gaussians.rotation4d import (
+    condition_on_time,
+    covariances_from_factors,
+    normalized_quaternions,
+    rotation_matrices_4d,
+    temporal_marginal,
+    time_row,
+)
 from d2_plugin.gaussians.slicing import reference_slice
+from d2_plugin.rasterizer import Splats, rasterize
 
 OUTPUTS = ("means", "covariances", "opacities")
 
@@ -65,25 +76,6 @@ def test_where_float32_is_short_of_digits_the_kernel_loses_no_more_than_torch() 
     for name, expected in exact_gradients.items():
         allowed = 2e-6 + 1.5 * relative_error(plain_gradients[name], expected)
         assert relative_error(native_gradients[name], expected) < allowed, name
-
-
-@pytest.mark.parametrize("name", GOLDEN)
-def test_kernel_agrees_with_the_reference_implementation(name: str) -> None:
-    mean, mean_time, scales, left, right, instant, at, covariance, marginal, _, _ = GOLDEN[name]
-    rows = {
-        "positions": torch.tensor([mean], dtype=torch.float32),
-        "log_scales": torch.tensor([scales[:3]]).log(),
-        "left": torch.tensor([left], dtype=torch.float32),
-        "opacity_logits": torch.zeros(1),
-        "times": torch.tensor([mean_time]),
-        "log_time_scales": torch.tensor(scales[3:]).log(),
-        "right": torch.tensor([right], dtype=torch.float32),
-    }
-    means, covariances, opacities, drawn = native_slice(rows, instant, *CONSTANTS)
-    assert drawn.tolist() == [0]
-    torch.testing.assert_close(means[0], torch.tensor(at, dtype=torch.float32), atol=5e-7, rtol=1e-6)
-    torch.testing.assert_close(covariances[0], torch.tensor(covariance, dtype=torch.float32), atol=2e-8, rtol=1e-5)
-    torch.testing.assert_close(opacities[0], torch.tensor(0.5 * marginal), atol=0, rtol=1e-6)
 
 
 def test_the_number_of_threads_changes_no_bit(temporal: bool, same_for_any_threads: Callable) -> None:
@@ -149,3 +141,258 @@ def test_a_model_slices_in_torch_where_there_is_no_compiler(temporal: bool, monk
     assert "_Slice" not in type(plain.covariances.grad_fn).__name__
     for one, other in zip(native, plain):
         torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-6)
+
+
+def tensor(*values: float) -> torch.Tensor:
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def random_quaternions(seed: int, count: int, dtype: torch.dtype = torch.float64) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    return normalized_quaternions(torch.randn(4, count, generator=generator, dtype=torch.float64)).to(dtype)
+
+
+@pytest.mark.parametrize("name", GOLDEN)
+def test_slice_agrees_with_the_reference_implementation(name: str) -> None:
+    mean, mean_time, scales, left, right, instant, at, covariance, marginal, variance, velocity = GOLDEN[name]
+    left, right = normalized_quaternions(tensor(*left)[:, None]), normalized_quaternions(tensor(*right)[:, None])
+    factors = rotation_matrices_4d(left, right) * tensor(*scales)[:, None]
+    spatial, speed = condition_on_time(factors)
+    v_t = (time_row(left, right) * tensor(*scales)[:, None]).square().sum(0)
+    np.testing.assert_allclose(v_t[0], variance, rtol=1e-12)
+    np.testing.assert_allclose(tensor(*mean) + speed[:, 0] * (instant - mean_time), tensor(*at), atol=5e-9)
+    np.testing.assert_allclose(covariances_from_factors(spatial)[0], tensor(*covariance), atol=5e-9)
+    np.testing.assert_allclose(temporal_marginal(tensor(instant - mean_time), v_t)[0], marginal, rtol=1e-12)
+    if velocity is not None:
+        np.testing.assert_allclose(speed[:, 0], tensor(*velocity), atol=5e-9)
+
+
+def test_rotations_are_proper_and_time_row_is_their_last_row() -> None:
+    left, right = random_quaternions(0, 200), random_quaternions(1, 200)
+    rotation = rotation_matrices_4d(left, right)
+    matrices = rotation.movedim(-1, 0)
+    torch.testing.assert_close(matrices @ matrices.mT, torch.eye(4, dtype=torch.float64).expand_as(matrices))
+    torch.testing.assert_close(torch.linalg.det(matrices), torch.ones(200, dtype=torch.float64))
+    torch.testing.assert_close(time_row(left, right), rotation[3])
+
+
+def test_factor_form_equals_the_schur_complement_in_float64() -> None:
+    scales = tensor(0.1, 0.2, 0.05, 0.5)[:, None]
+    factors = rotation_matrices_4d(random_quaternions(3, 100), random_quaternions(4, 100)) * scales
+    sigma = torch.einsum("ikn,jkn->nij", factors, factors)
+    u, v = sigma[:, :3, 3], sigma[:, 3, 3]
+    schur = sigma[:, :3, :3] - u[:, :, None] * u[:, None] / v[:, None, None]
+    spatial, velocity = condition_on_time(factors)
+    torch.testing.assert_close(torch.einsum("ikn,jkn->nij", spatial, spatial), schur)
+    torch.testing.assert_close(velocity.T, u / v[:, None])
+
+
+PATHS = {
+    "kernel": (native_slice, torch.float32),
+    "torch, float32": (reference_slice, torch.float32),
+    "torch, float64": (reference_slice, torch.float64),
+}
+
+IDENTITY = torch.tensor([1.0, 0, 0, 0])
+
+
+class Sliced(NamedTuple):
+    means: Tensor
+    covariances: Tensor
+    opacities: Tensor
+    rows: Tensor
+    gradients: dict[str, Tensor]
+
+    def assert_finite(self) -> None:
+        for name, tensor in (*zip(self._fields, self[:3]), *self.gradients.items()):
+            assert torch.isfinite(tensor).all(), name
+
+
+@pytest.fixture(params=list(PATHS))
+def take_slice(request: pytest.FixtureRequest) -> Callable[..., Sliced]:
+    """Slice and differentiate the sum of all outputs, by one of the paths."""
+    slice_in, dtype = PATHS[request.param]
+    if slice_in is native_slice and kernel.library() is None:
+        pytest.skip("there is no C++ compiler")
+
+    def run(rows: Mapping[str, Tensor], at: float) -> Sliced:
+        raw = {name: value.to(dtype, copy=True).requires_grad_() for name, value in rows.items()}
+        *outputs, drawn = slice_in(raw, at, *CONSTANTS)
+        torch.autograd.backward(outputs, [torch.ones_like(output) for output in outputs])
+        gradients = {name: torch.zeros_like(value) if value.grad is None else value.grad for name, value in raw.items()}
+        return Sliced(*(output.detach() for output in outputs), drawn, gradients)
+
+    return run
+
+
+def axis_aligned(scales: tuple[float, float, float], time_scale: float, time: float = 0.0) -> dict[str, Tensor]:
+    """One Gaussian at (1, 2, 3) that does not move."""
+    return {
+        "positions": torch.tensor([[1.0, 2, 3]]),
+        "log_scales": torch.tensor([scales]).log(),
+        "left": IDENTITY[None].clone(),
+        "opacity_logits": torch.zeros(1),
+        "times": torch.tensor([time]),
+        "log_time_scales": torch.tensor([time_scale]).log(),
+        "right": IDENTITY[None].clone(),
+    }
+
+
+@pytest.mark.parametrize("temporal", [True, False])
+def test_a_zero_quaternion_is_the_identity_and_receives_no_gradient(take_slice, temporal: bool) -> None:
+    rows = random_rows(40, temporal, time_scale=20.0)
+    sides = ("left", "right") if temporal else ("left",)
+    for side in sides:
+        rows[side][3] = IDENTITY
+    expected = take_slice(rows, 0.5)
+    for side in sides:
+        rows[side][3] = 0
+    found = take_slice(rows, 0.5)
+    found.assert_finite()
+    for one, other in zip(found[:4], expected):
+        assert torch.equal(one, other)
+    for side in sides:
+        assert not found.gradients[side][3].any()
+        assert expected.gradients[side][3].any()
+
+
+@pytest.mark.parametrize("norm", [1e-20, 1e-6, 1e6, 1e20])
+@pytest.mark.parametrize("temporal", [True, False])
+def test_the_norm_of_a_quaternion_changes_nothing_but_its_gradient(take_slice, temporal: bool, norm: float) -> None:
+    rows = random_rows(40, temporal, time_scale=20.0)
+    sides = ("left", "right") if temporal else ("left",)
+    for side in sides:
+        rows[side] = torch.nn.functional.normalize(rows[side])
+    expected = take_slice(rows, 0.5)
+    for side in sides:
+        rows[side] = rows[side] * norm
+    found = take_slice(rows, 0.5)
+    found.assert_finite()
+    for one, other in zip(found[:4], expected):
+        torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-5)
+    for side in sides:
+        assert relative_error(found.gradients[side].double() * norm, expected.gradients[side].double()) < 1e-4
+
+
+@pytest.mark.parametrize("norm", [0.0, 1e-4, 1.0, 6e4])
+def test_quaternions_in_half_precision_have_length_one(norm: float) -> None:
+    unit = normalized_quaternions(torch.tensor([[0.6], [0.0], [0.8], [0.0]]).mul(norm).half())
+    torch.testing.assert_close(unit.norm(dim=0), torch.ones(1, dtype=torch.float16), atol=2e-3, rtol=0)
+
+
+@pytest.mark.parametrize("temporal", [True, False])
+def test_gradients_include_the_normalisation_of_quaternions(temporal: bool) -> None:
+    rows = {name: value.double() for name, value in random_rows(3, temporal, time_scale=5.0).items()}
+    for side, norm in (("left", 0.3), ("right", 3.0)):
+        if side in rows:
+            rows[side] = norm * torch.nn.functional.normalize(rows[side])
+    names = list(rows)
+
+    def outputs(*values: Tensor) -> tuple[Tensor, ...]:
+        return reference_slice(dict(zip(names, values)), 0.5, *CONSTANTS)[:3]
+
+    assert torch.autograd.gradcheck(outputs, [rows[name].requires_grad_() for name in names])
+
+
+@pytest.mark.parametrize("log_scale", [100.0, -100.0])
+@pytest.mark.parametrize("name", ["log_scales", "log_time_scales"])
+def test_a_log_scale_beyond_float32_saturates(take_slice, name: str, log_scale: float) -> None:
+    rows = random_rows(40, True, time_scale=20.0)
+    rows["times"][3] = 0.5
+    rows[name].view(40, -1)[3, 0] = math.copysign(30.0, log_scale)
+    at_the_limit = take_slice(rows, 0.5)
+    rows[name].view(40, -1)[3, 0] = log_scale
+    found = take_slice(rows, 0.5)
+    found.assert_finite()
+    assert found.gradients[name].view(40, -1)[3, 0] == 0
+    for one, other in zip(found[:4], at_the_limit):
+        assert torch.equal(one, other)
+
+
+def test_a_vanishing_temporal_variance_at_its_own_instant_is_fully_there(take_slice) -> None:
+    found = take_slice(axis_aligned((0.1, 0.1, 0.1), 1e-38, time=0.5), 0.5)
+    found.assert_finite()
+    assert found.rows.tolist() == [0]
+    assert found.opacities.tolist() == [0.5]
+    assert found.gradients["opacity_logits"].tolist() == [0.25]
+
+
+@pytest.mark.parametrize("offset", [1e-6, 1.0, 1e9, 1e30])
+def test_a_vanishing_temporal_variance_at_another_instant_is_not_there(take_slice, offset: float) -> None:
+    found = take_slice(axis_aligned((0.1, 0.1, 0.1), 1e-38), offset)
+    assert len(found.rows) == 0
+    assert all(not gradient.any() for gradient in found.gradients.values())
+
+
+@pytest.mark.parametrize("deviations", [0.0, 1.0, 2.4])
+@pytest.mark.parametrize("variance", [1e-20, 1e-10, 1.0, 1e10, 1e20])
+def test_the_marginal_depends_on_standard_deviations_alone(take_slice, variance: float, deviations: float) -> None:
+    sigma = math.sqrt(variance)
+    found = take_slice(axis_aligned((0.1, 0.1, 0.1), sigma, time=-deviations * sigma), 0.0)
+    found.assert_finite()
+    marginal = math.exp(-0.5 * deviations**2)
+    torch.testing.assert_close(found.opacities[0].item(), 0.5 * marginal, rtol=1e-5, atol=0)
+    by_time = found.gradients["times"][0].item() * sigma
+    torch.testing.assert_close(by_time, 0.5 * marginal * deviations, rtol=1e-5, atol=1e-12)
+
+
+def test_a_slice_of_a_long_life_is_positive_definite_as_the_rasterizer_gets_it(take_slice) -> None:
+    """Long in time, a hundredth wide in space: the Schur complement of these loses more than half."""
+    rows = random_rows(2000, True)
+    rows["log_scales"] = torch.tensor([1e-2, 1e-2, 1e-2]).log().expand(2000, 3)
+    rows["log_time_scales"] = torch.full((2000,), math.log(100.0))
+    found = take_slice(rows, 0.5)
+    xx, xy, xz, yy, yz, zz = found.covariances.double().T
+    matrices = torch.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], -1).view(-1, 3, 3)
+    # One eigenvalue is 1e-4, one may be as large as 1e4: beyond that, the six float32 numbers cannot hold it.
+    narrow = torch.linalg.eigvalsh(matrices)[:, 2] < 1e2
+    assert narrow.double().mean() > 0.9
+    assert (torch.linalg.eigvalsh(matrices)[narrow, 0] > 0).all()
+
+
+def flying(extent: float, angle: float) -> dict[str, Tensor]:
+    """One Gaussian long in x, turned into time by `angle`: it moves by cot(angle) per unit of time."""
+    rows = axis_aligned((extent, 0.01, 0.01), 0.01)
+    half = angle / 2
+    rows["left"] = torch.tensor([[math.cos(half), 0, 0, math.sin(half)]])
+    rows["right"] = torch.tensor([[math.cos(half), 0, 0, -math.sin(half)]])
+    return rows
+
+
+@pytest.mark.parametrize(("extent", "angle"), [(1e6, 1e-3), (1e13, 1e-6)])
+def test_a_huge_velocity_carries_a_gaussian_out_of_sight(take_slice, extent: float, angle: float) -> None:
+    at = extent * math.sin(angle)  # one standard deviation later
+    found = take_slice(flying(extent, angle), at)
+    found.assert_finite()
+    assert found.means[0, 0].abs().item() == pytest.approx(extent, rel=1e-3)
+    assert (found.covariances[0, [0, 3, 5]].sqrt() < 1e-4 * extent).all(), "its mean is far away, it is not wide"
+    model, view = make_model(), make_views()[0]
+    seen = model.slice_at(view)
+    together = Splats(
+        *(torch.cat([part.detach(), other.float()]) for part, other in zip(seen[:3], found)),
+        torch.arange(len(seen.rows) + 1),
+    )
+    colors = torch.rand(len(seen.rows) + 1, 3, generator=torch.Generator().manual_seed(0))
+    alone = rasterize(seen, colors[:-1], view)
+    for part, expected in zip(rasterize(together, colors, view)[:3], alone):
+        assert torch.equal(part, expected)
+
+
+def test_extreme_draws_stay_finite_with_opacities_in_0_1(take_slice) -> None:
+    count, generator = 20_000, torch.Generator().manual_seed(1)
+
+    def uniform(low: float, high: float, *shape: int) -> Tensor:
+        return low + (high - low) * torch.rand(count, *shape, generator=generator)
+
+    rows = random_rows(count, True)
+    rows["positions"] *= 10 ** uniform(-3, 6, 1)
+    rows["log_scales"] = uniform(-6, 3, 3) * math.log(10)
+    rows["log_time_scales"] = uniform(-6, 3) * math.log(10)
+    rows["opacity_logits"] = uniform(-20, 20)
+    rows["left"] *= 10 ** uniform(-10, 10, 1)
+    rows["right"] *= 10 ** uniform(-10, 10, 1)
+    rows["times"] = torch.randn(count, generator=generator) * 10 ** uniform(-6, 3)
+    found = take_slice(rows, 0.0)
+    found.assert_finite()
+    assert len(found.rows) > count / 10
+    assert ((found.opacities >= 0) & (found.opacities <= 1)).all()

@@ -1,4 +1,4 @@
-"""Verified-depth supervision: the penalty, the paper's loss, and the loss of a render by torch and by the kernel."""
+"""Verified-depth supervision: the paper's loss, what sigma and far pixels add, by torch and by the kernel."""
 
 from __future__ import annotations
 
@@ -9,36 +9,27 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from torch import Tensor
 
 from d2_plugin.hooks import depth_loss as module
 from d2_plugin.hooks import native_depth_loss
-from d2_plugin.hooks.depth_loss import DepthLossConfig, charbonnier, depth_loss, supervision
-from d2_plugin.hooks.prior import KnownMaps, PriorLoader
+from d2_plugin.hooks import prior as loading
+from d2_plugin.hooks.densify import Densify, DensifyConfig, under_reconstructed
+from d2_plugin.hooks.depth_loss import DepthLoss, DepthLossConfig, supervision
+from d2_plugin.hooks.hook import Context
+from d2_plugin.hooks.prior import FAR, JUDGES, KnownMaps, PriorLoader
+from d2_plugin.hooks.rendered_depth import rendered_depth
 from d2_plugin.protocol import DepthPrior, Label, View
 
 PAPER = DepthLossConfig(tau_v=0.5, epsilon=0.01, opaque=0)
+
 LABELS = (Label.EMPTY, Label.MONO, Label.VERIFIED, Label.CONFLICT, Label.AGREED, Label.FAR)
 
 
 def tensor(*values: float) -> Tensor:
     return torch.tensor(values)
-
-
-class TestThePapersLoss:
-    def test_counts_only_pixels_that_are_trusted_and_validly_rendered(self) -> None:
-        depth, prior = tensor(2.0, 2.0, 2.0), tensor(1.0, 4.0, 8.0)
-        valid, verified = torch.tensor([True, True, False]), torch.tensor([True, False, True])
-        expected = charbonnier(tensor(1.0), 0.01).squeeze()
-        torch.testing.assert_close(depth_loss(depth, valid, prior, verified, 0.01), expected)
-
-    def test_bad_prior_pixels_outside_the_mask_never_leak(self) -> None:
-        depth = torch.tensor([1.0, 2.0, 2.0, 2.0, 2.0], requires_grad=True)
-        prior, verified = tensor(1.1, math.nan, math.inf, 0.0, -1.0), torch.tensor([True, *[False] * 4])
-        loss = depth_loss(depth, torch.ones(5, dtype=torch.bool), prior, verified, 0.01)
-        loss.backward()
-        torch.testing.assert_close(loss, charbonnier(tensor(-1 / 11), 0.01)[0])
-        assert not depth.grad[1:].any()
 
 
 def prior_of(seed: int, height: int, width: int, labels: tuple[Label, ...] = LABELS, paper: bool = False) -> DepthPrior:
@@ -76,7 +67,7 @@ def loss_and_gradients(
     return [loss.detach(), *torch.autograd.grad(loss, leaves)]
 
 
-class TestSupervision:
+class TestRender:
     """What a render costs: the paper's formula over all maps, and what lets light through."""
 
     @pytest.mark.parametrize("opaque", [0.0, 3.0])
@@ -187,7 +178,7 @@ def test_the_hook_adds_the_weighted_mean_of_a_batch(count: int) -> None:
             torch.testing.assert_close(one, 0.7 / count * other)
 
 
-class TestLoader:
+class TestMemory:
     def test_priors_stay_in_memory_as_long_as_they_fit(self) -> None:
         prior, reads = prior_of(0, 360, 640), []
         store = SimpleNamespace(prior=lambda camera, frame: reads.append(frame) or prior)
@@ -198,3 +189,200 @@ class TestLoader:
             for view in (*views, *views):
                 assert loader.known(view).near > 0
             assert len(reads) == expected
+
+
+CONFIG = DepthLossConfig(tau_v=0.5, epsilon=0.01, sigma_full=0.05, opaque=0)
+
+SHAPE = (7, 9)
+
+seeds = st.integers(0, 10_000)
+
+
+@pytest.fixture(autouse=True)
+def single_far_pixels_count(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Here far pixels lie alone, all outline; `TestOutline` shows what that leaves out."""
+    monkeypatch.setattr(loading, "OUTLINE", 0)
+
+
+def loader_of(prior: DepthPrior) -> tuple[PriorLoader, View]:
+    """A loader whose store has one prior, and the view that it belongs to."""
+    height, width = prior.depth.shape
+    view = View("a", 0, 0.0, torch.eye(4), torch.eye(3), width, height)
+    return PriorLoader(SimpleNamespace(prior=lambda camera, frame: prior)), view
+
+
+def known(prior: DepthPrior) -> KnownMaps | None:
+    loader, view = loader_of(prior)
+    return loader.known(view)
+
+
+def papers_sigma(labels: Tensor) -> Tensor:
+    """0 at verified pixels and infinite elsewhere."""
+    return torch.where(labels == Label.VERIFIED, 0.0, torch.inf)
+
+
+def random_maps(seed: int, labels: tuple[Label, ...]) -> tuple[Tensor, Tensor, DepthPrior, Tensor]:
+    """depth_sum, alpha, a prior with these labels, and sigmas from 1e-4 to 10; float64."""
+    g = torch.Generator().manual_seed(seed)
+    depth_sum, alpha, depth, exponent = torch.rand(4, *SHAPE, generator=g, dtype=torch.float64)
+    alpha = torch.where((alpha - 0.5).abs() < 0.01, 0.6, alpha)  # away from the step at tau_v
+    chosen = torch.tensor([int(label) for label in labels], dtype=torch.uint8)
+    drawn = chosen[torch.randint(len(chosen), SHAPE, generator=g)]
+    return depth_sum * 3, alpha, DepthPrior(depth + 0.5, drawn), 10 ** (5 * exponent - 4)
+
+
+def gradients(loss: Tensor, *inputs: Tensor) -> list[Tensor]:
+    return [loss.detach(), *torch.autograd.grad(loss, inputs)]
+
+
+class TestThePaperIsASpecialCase:
+    """Its equations, written out; AGREED and FAR are additions to it and do not occur."""
+
+    LABELS = (Label.EMPTY, Label.MONO, Label.VERIFIED, Label.CONFLICT)
+
+    @given(seeds, st.booleans())
+    @settings(max_examples=50, deadline=None)
+    def test_loss_and_gradient(self, seed: int, with_sigma: bool) -> None:
+        """L = mean over Omega^v and M^r of sqrt(r^2 + e^2) - e, r = (D_hat - D*) / (D* + eps)."""
+        depth_sum, alpha, prior, _ = random_maps(seed, self.LABELS)
+        z, a = depth_sum.requires_grad_(), alpha.requires_grad_()
+        counted = (prior.labels == Label.VERIFIED) & (a > 0.5)
+        residual = (z / (a + 1e-8) - prior.depth)[counted] / (prior.depth[counted] + 1e-8)
+        paper = (torch.sqrt(residual**2 + 0.01**2) - 0.01).sum() / (counted.sum() + 1e-8)
+        pixels = known(prior._replace(sigma=papers_sigma(prior.labels)) if with_sigma else prior)
+        found = supervision(z, a, pixels, CONFIG)
+        for ours, theirs in zip(gradients(found, z, a), gradients(paper, z, a), strict=True):
+            torch.testing.assert_close(ours, theirs, rtol=1e-7, atol=1e-12)
+
+    @given(seeds, st.booleans())
+    @settings(max_examples=50, deadline=None)
+    def test_region(self, seed: int, with_sigma: bool) -> None:
+        """U = Omega^p and (not M^r, or |D_hat - D*| / (D* + eps) > tau_u), with a threshold of its own for mono-only"""
+        depth_sum, alpha, prior, _ = random_maps(seed, self.LABELS)
+        config = DensifyConfig()
+        verified, mono = prior.labels == Label.VERIFIED, prior.labels == Label.MONO
+        off = (depth_sum / (alpha + 1e-8) - prior.depth).abs() / (prior.depth + 1e-8)
+        wrong = (verified & (off > config.tau_u)) | (mono & (off > config.tau_u_mono))
+        paper = ((verified | mono) & ~(alpha > config.tau_v)) | wrong
+        if with_sigma:
+            prior = prior._replace(sigma=papers_sigma(prior.labels))
+        assert torch.equal(region(prior, depth_sum, alpha, config), paper)
+        assert paper.any()
+
+
+def region(prior: DepthPrior, depth_sum: Tensor, alpha: Tensor, config: DensifyConfig) -> Tensor:
+    """U of a render, as the hook finds it."""
+    depth, valid = rendered_depth(depth_sum, alpha, config.tau_v)
+    return under_reconstructed(depth, valid, prior.depth, prior.support, Densify(config)._tau_u(prior))
+
+
+class TestSupervision:
+    def test_a_far_pixel_pulls_nothing_from_behind_and_pushes_what_is_in_front(self) -> None:
+        labels = torch.full((1, 3), int(Label.FAR), dtype=torch.uint8)
+        pixels = known(DepthPrior(torch.full((1, 3), 10.0), labels, sigma=torch.full((1, 3), torch.inf)))
+        a = torch.full((1, 3), 0.8, requires_grad=True)
+        z = (torch.tensor([[4.0, 10.0, 400.0]]) * 0.8).requires_grad_()  # in front, at the bound, behind
+        loss = supervision(z, a, pixels, CONFIG)
+        _, by_sum, by_alpha = gradients(loss, z, a)
+        assert by_sum[0, 0] < 0 < by_alpha[0, 0], "a step of descent must deepen it and thin it"
+        assert by_sum[0, 2] == by_alpha[0, 2] == 0
+        assert by_sum[0, 1].abs() < 1e-4
+        assert loss.item() == pytest.approx((0.36 + 0.01**2) ** 0.5 / 3 - 0.01 / 3, rel=1e-4)
+
+    def test_weight_falls_as_one_over_sigma(self) -> None:
+        sigma = torch.tensor([[0.0, 0.01, 0.05, 0.1, 0.2, 1.0]]).double()
+        prior = DepthPrior(torch.ones(1, 6).double(), torch.full((1, 6), int(Label.MONO), dtype=torch.uint8))
+        a = torch.ones(1, 6).double()
+        z = (1e5 * a).requires_grad_()  # so far off that the penalty is linear
+        pixels = known(prior._replace(sigma=sigma))
+        _, slope = gradients(supervision(z, a, pixels, CONFIG), z)
+        expected = torch.tensor([1, 1, 1, 0.5, 0.25, 0.05]).double()
+        torch.testing.assert_close(slope[0] / slope[0, 0], expected, rtol=1e-6, atol=0)
+
+    def test_within_sigma_the_penalty_is_flat(self) -> None:
+        """At a residual of 1 %, sigma 10 % pulls a tenth of what its weight allows; sigma 0 pulls .7 of it."""
+        slopes = []
+        for sigma in (0.0, 0.1):
+            prior = DepthPrior(torch.ones(1, 1), torch.ones(1, 1).byte(), sigma=torch.full((1, 1), sigma))
+            z = torch.full((1, 1), 1.01, requires_grad=True)
+            slopes.append(gradients(supervision(z, torch.ones(1, 1), known(prior), CONFIG), z)[1].item())
+        assert slopes == pytest.approx([0.5**0.5, 0.1], rel=0.01)
+
+    def test_infinite_sigma_is_not_in_the_loss_but_proposes(self) -> None:
+        labels = torch.full((1, 3), int(Label.MONO), dtype=torch.uint8)
+        prior = DepthPrior(torch.ones(1, 3), labels, sigma=torch.full((1, 3), torch.inf))
+        assert known(prior) is None
+        config = DensifyConfig(tau_u=0.1, tau_u_mono=0.2)
+        found = region(prior, torch.tensor([[1.15, 1.25, 0.0]]), torch.tensor([[1.0, 1.0, 0.0]]), config)
+        assert found.tolist() == [[False, True, True]]
+
+    def test_a_finite_sigma_widens_the_threshold_of_insertion_and_never_narrows_it(self) -> None:
+        sigma = torch.tensor([[0.0, 0.04, 0.1, 0.1]])
+        labels = torch.tensor([[Label.VERIFIED, Label.MONO, Label.MONO, Label.FAR]], dtype=torch.uint8)
+        prior = DepthPrior(torch.ones(1, 4), labels, sigma=sigma)
+        config = DensifyConfig(tau_u=0.1)
+        off = torch.tensor([[1.11, 1.11, 1.24, 1.5]])
+        assert region(prior, off, torch.ones(1, 4), config).tolist() == [[True, True, False, False]]
+        assert region(prior, off + 0.02, torch.ones(1, 4), config).tolist() == [[True, True, True, False]]
+        assert not region(prior, torch.zeros(1, 4), torch.zeros(1, 4), config)[0, 3], "nothing is inserted far away"
+
+
+class TestLoader:
+    def test_pixels_judge_where_sigma_is_small_whatever_their_label(self) -> None:
+        labels = torch.tensor([[Label.VERIFIED, Label.VERIFIED, Label.MONO, Label.FAR, Label.CONFLICT, Label.MONO]])
+        sigma = torch.tensor([[0.0, 2 * JUDGES, JUDGES, 0.0, 0.0, 0.0]])
+        depth = torch.tensor([[1.0, 1, 1, 1, 0, torch.nan]])
+        loader, view = loader_of(DepthPrior(depth, labels.byte(), sigma=sigma))
+        assert loader(view).reliability.tolist() == [[1, 0, 1, 0, 0, 0]]
+        assert loader.known(view).kind.tolist() == [[1, 1, 1, FAR, 0, 0]]
+
+
+class TestStiff:
+    def test_everything_extreme_in_one_view(self) -> None:
+        """sigma 0 to 1e30, depths 1e-3 to 1e6, alpha an ulp on either side of tau_v, NaN and infinity in the prior."""
+        nan, inf = torch.nan, torch.inf
+        depth = torch.tensor([[1e-3, 1e6, 1e-3, 1e6, 1.0, 1.0, nan, inf, 1.0, 1e6]])
+        sigma = torch.tensor([[0.0, 1e-4, 1.0, 0.0, 1e30, nan, 0.0, 0.0, 0.0, 0.0]])
+        labels = torch.full((1, 10), int(Label.VERIFIED), dtype=torch.uint8)
+        labels[0, 9] = Label.FAR
+        pixels = known(DepthPrior(depth, labels, sigma=sigma))
+        assert pixels.kind.flatten().nonzero().flatten().tolist() == [0, 1, 2, 3, 4, 8, 9]
+        half = torch.tensor(0.5)
+        sides = [torch.nextafter(half, half * s).item() for s in (0, 2)]
+        a = torch.tensor([[sides[1], 1.0, 1.0, sides[1], 1.0, 1.0, 1.0, 1.0, sides[0], 1.0]]).requires_grad_()
+        z = torch.tensor([[1e6, 1e-3, 1e6, 1e6, 1.0, 1.0, 1.0, 1.0, 7.0, 1e-3]]).requires_grad_()
+        loss, by_sum, by_alpha = gradients(supervision(z, a, pixels, CONFIG), z, a)
+        assert loss.isfinite()
+        assert by_sum.isfinite().all()
+        assert by_alpha.isfinite().all()
+        assert not by_sum[0, 5:9].any(), "no depth, no sigma, or alpha an ulp below tau_v"
+        assert by_sum[0, [0, 2, 3]].gt(0).all()
+        assert by_sum[0, [1, 9]].lt(0).all()
+
+    def test_alpha_at_tau_v_itself_does_not_count(self) -> None:
+        pixels = known(DepthPrior(torch.ones(1, 1), torch.full((1, 1), int(Label.FAR), dtype=torch.uint8)))
+        z = torch.full((1, 1), 0.1, requires_grad=True)
+        for alpha, counts in ((0.5, False), (0.5000001, True)):
+            loss, slope = gradients(supervision(z, torch.full((1, 1), alpha), pixels, CONFIG), z)
+            assert (loss > 0) == counts == bool(slope.any())
+
+    def test_a_view_of_far_pixels_alone_is_supervised(self) -> None:
+        labels = torch.full((2, 2), int(Label.FAR), dtype=torch.uint8)
+        loader, view = loader_of(DepthPrior(torch.full((2, 2), 9.0), labels))
+        rendered = torch.full((2, 2), 3.0, requires_grad=True), torch.ones(2, 2)
+        backbone = SimpleNamespace(rendered_depth=lambda view: rendered)
+        loss = DepthLoss(CONFIG).loss(Context(1, backbone, [view], loader, torch.Generator()))
+        assert loss.item() == pytest.approx(CONFIG.weight * (6 / 9 - 0.01), rel=1e-3)
+
+
+class TestOutline:
+    def test_the_outline_of_a_sky_says_nothing_and_the_rim_of_the_image_is_no_outline(
+        self, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(loading, "OUTLINE", 2)
+        labels = torch.full((10, 12), int(Label.VERIFIED), dtype=torch.uint8)
+        labels[:6] = int(Label.FAR)
+        sigma = torch.where(labels == Label.FAR, torch.inf, 0.01)
+        found = known(DepthPrior(torch.full((10, 12), 5.0), labels, None, sigma))
+        rows = (found.kind == FAR).any(1), (found.kind == 1).any(1)
+        assert [row.nonzero().flatten().tolist() for row in rows] == [[0, 1, 2, 3], [6, 7, 8, 9]]

@@ -1,23 +1,33 @@
-"""The paper's equations as pure functions, at the points where an implementation goes wrong."""
+"""The paper's equations as pure functions, insertion that covers what the prior knows, and the table of hooks."""
 
 from __future__ import annotations
 
 import math
+import os
+import re
+import subprocess
+import sys
+import textwrap
+from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from tiny import ALL_HOOKS, HEIGHT, WIDTH, TinyStore, make_adapter, make_model, make_views
 
+from d2_plugin import hooks
+from d2_plugin.config import DensifyConfig
 from d2_plugin.hooks.densify import (
+    Densify,
     back_project,
-    first_of_each,
-    frustum_cells,
-    shuffled_pixels,
-    under_reconstructed,
 )
+from d2_plugin.hooks.hook import Context, Window
 from d2_plugin.hooks.prior import PriorLoader
-from d2_plugin.hooks.prune import depth_inconsistency, opacity_contribution
-from d2_plugin.protocol import DepthPrior, Label, View
+from d2_plugin.plugin import D2Hooks
+from d2_plugin.protocol import DepthPrior, Label, Points, View
 
 
 def tensor(*values: float) -> torch.Tensor:
@@ -46,21 +56,7 @@ def test_trusted_are_verified_and_agreed_pixels_and_no_others(label: Label) -> N
     assert (pixels is not None) == (prior.trusted | prior.far).all()
 
 
-class TestPruning:
-    def test_no_verified_pixel_is_no_evidence(self) -> None:
-        assert depth_inconsistency(tensor(float("nan")), tensor(0.0), 0.1).item() == 0
-
-    def test_contribution_is_zero_where_a_gaussian_is_visible_nowhere(self) -> None:
-        torch.testing.assert_close(opacity_contribution(tensor(0.0, 1.5), tensor(0.0, 3.0)), tensor(0.0, 0.5))
-
-
 class TestDensification:
-    def test_region_holds_both_conditions_and_nothing_outside_the_support(self) -> None:
-        depth, valid = tensor(0.0, 1.0, 1.3, 1.3), torch.tensor([False, True, True, True])
-        support = torch.tensor([True, True, True, False])
-        region = under_reconstructed(depth, valid, torch.ones(4), support, tau_u=0.2)
-        assert region.tolist() == [True, False, True, False]
-
     def test_back_projection_of_a_projected_point_is_the_point(self) -> None:
         view = a_view()
         pixels = torch.tensor([[0, 0], [63, 47], [10, 20]])
@@ -71,27 +67,159 @@ class TestDensification:
         torch.testing.assert_close(camera[:, 2], depth)
         torch.testing.assert_close(image[:, :2] / image[:, 2:] - 0.5, pixels.double())
 
-    def test_shuffled_pixels_are_the_mask_each_once(self) -> None:
-        mask = torch.rand(20, 30, generator=torch.Generator().manual_seed(0)) > 0.5
-        pixels = shuffled_pixels(mask, torch.Generator().manual_seed(1))
-        assert len(torch.unique(pixels, dim=0)) == len(pixels) == int(mask.sum())
-        assert mask[pixels[:, 1], pixels[:, 0]].all()
-        assert not torch.equal(pixels, shuffled_pixels(mask, torch.Generator().manual_seed(2)))
-        assert shuffled_pixels(torch.zeros_like(mask), torch.Generator()).shape == (0, 2)
 
-    def test_points_of_one_cell_share_a_key_and_distant_ones_do_not(self) -> None:
-        view = a_view()
-        pixels = torch.tensor([[10, 10], [10, 10], [30, 10], [10, 10]])
-        points = back_project(view, pixels, torch.tensor([2.0, 2.001, 2.0, 3.0], dtype=torch.float64))
-        cells = frustum_cells(view, points, stride=4, depth_step=0.1)
-        assert cells[0] == cells[1]
-        assert len(set(cells.tolist())) == 3
+KNOWN = HEIGHT * (WIDTH - 1)
+"""Pixels of the tiny prior's support in one view: all but the column in conflict."""
 
-    def test_points_behind_or_outside_have_no_cell(self) -> None:
-        view = a_view()
-        points = back_project(view, torch.tensor([[10, 10], [500, 10]]), torch.tensor([-2.0, 2.0], dtype=torch.float64))
-        assert frustum_cells(view, points, 1, 0.1).tolist() == [-1, -1]
 
-    def test_first_of_each_keeps_one_per_key_in_order(self) -> None:
-        assert first_of_each(torch.tensor([5, 3, 5, 5, 3, 7])).tolist() == [True, True, False, False, False, True]
-        assert first_of_each(torch.zeros(0, dtype=torch.int64)).tolist() == []
+def proposed(views: list[View], **settings: float) -> Points:
+    """What densify wants to insert into a model of one Gaussian that is far away from the plane."""
+    model = make_model(count=1)
+    with torch.no_grad():
+        model.gaussians["positions"].copy_(torch.tensor([[0.0, 0.0, 50.0]]))
+    numbers = torch.Generator().manual_seed(0)
+    context = Context(1, make_adapter(model), (), PriorLoader(TinyStore()), numbers, lambda: views)
+    return Densify(DensifyConfig(**settings)).edit(context).insert
+
+
+def squares(points: Points, view: View, side: float) -> list[tuple[int, int]]:
+    """The square of the image that each point lies in."""
+    camera = points.positions + view.T_camera_world[:3, 3]
+    pixels = (camera / camera[:, 2:] @ view.K.T)[:, :2] / side
+    return [(int(column), int(row)) for column, row in pixels.tolist()]
+
+
+@pytest.mark.parametrize("spacing", [1.0, 2.0, 4.0, 8.0])
+def test_every_square_of_a_bare_image_gets_one_gaussian(spacing: float) -> None:
+    view = make_views()[0]
+    found = squares(proposed([view], spacing=spacing), view, spacing)
+    every = {(c, r) for c in range(math.ceil(WIDTH / spacing)) for r in range(math.ceil(HEIGHT / spacing))}
+    in_conflict = {(WIDTH // 2, r) for r in range(HEIGHT)} if spacing == 1 else set()
+    assert len(found) == len(set(found))
+    assert set(found) == every - in_conflict
+
+
+def test_a_gaussian_is_as_large_as_the_distance_to_the_next() -> None:
+    points = proposed([make_views()[0]], spacing=4.0, scale=0.7)
+    torch.testing.assert_close(points.scales, torch.full_like(points.scales, 0.7 * 4 * 3.0 / 30))
+
+
+@given(budget=st.integers(1, 400))
+def test_a_budget_is_kept_and_spreads_its_samples_over_the_image(budget: int) -> None:
+    view = make_views()[0]
+    points = proposed([view], spacing=1.0, budget_per_view=budget)
+    spacing = math.sqrt(KNOWN / budget)
+    assert len(points.positions) <= budget
+    # Of the squares that fit into the image at this spacing all are filled but those in the column in conflict.
+    columns, rows = math.floor(WIDTH / spacing), math.floor(HEIGHT / spacing)
+    assert len(points.positions) >= min(budget, (columns - 1) * rows) - 1
+    expected = torch.full_like(points.scales, DensifyConfig().scale * spacing * 3.0 / 30)
+    torch.testing.assert_close(points.scales, expected)
+
+
+def test_what_one_view_inserts_another_does_not_insert_again() -> None:
+    views = make_views()[:3]
+    apart = sum(len(proposed([view], spacing=4.0).positions) for view in views)
+    assert len(proposed(views, spacing=4.0).positions) < 0.7 * apart
+
+
+def test_the_first_evaluation_looks_through_every_camera_seen_so_far() -> None:
+    looked: list[set[str]] = []
+
+    class Spied(TinyStore):
+        def prior(self, camera: str, frame: int) -> DepthPrior:
+            looked[-1].add(camera)
+            return super().prior(camera, frame)
+
+    config = replace(
+        ALL_HOOKS, views_per_evaluation=1, prune=None, depth_loss=None, densify=DensifyConfig(start=6, every=2, stop=9)
+    )
+    d2 = D2Hooks(config, make_adapter(make_model()), Spied())
+    views = make_views()
+    for step in range(1, 9):
+        d2.loss(step, views[(step - 1) % len(views)])
+        looked.append(set())
+        d2.step(step)
+    assert looked[:6] == [set()] * 5 + [{"cam0", "cam1", "cam2"}]
+
+
+@given(start=st.integers(0, 50), every=st.integers(1, 20), length=st.integers(0, 60), steps=st.integers(1, 120))
+def test_a_window_is_due_at_its_start_and_every_so_often_until_its_stop(
+    start: int, every: int, length: int, steps: int
+) -> None:
+    window = Window(start, start + length, every)
+    assert [step for step in range(steps) if window.due(step)] == [
+        step for step in range(start, start + length, every) if step < steps
+    ]
+
+
+@pytest.mark.parametrize("iterations", [1, 20, 40, 500, 2000, 30_000])
+def test_a_schedule_inserts_early_and_leaves_half_of_the_run_to_train(iterations: int) -> None:
+    config = DensifyConfig.for_iterations(iterations)
+    assert config.start <= max(1, iterations / 40)
+    assert config.start < config.stop
+    if iterations >= 40:
+        assert config.stop <= iterations / 2 + config.every + 1
+    assert config.budget_per_view == 10 * iterations
+
+
+FILE_OF_THE_HOOK = """
+from dataclasses import dataclass
+from torch import Tensor
+from d2_plugin.hooks import Context, Hook, HookConfig
+from d2_plugin.settings import NotNegative
+"""
+
+SCRIPT = """
+from d2_plugin import hooks
+import shrink
+from shrink import Shrink, ShrinkConfig
+HookRow = hooks.HookRow
+hooks.HOOKS |= {ROW}
+
+import torch
+from d2_plugin import D2Config, D2Error
+from d2_plugin.config import for_iterations
+from d2_plugin.runs.settings import HOOK_NAMES, RunSettings, check, hook_config
+from d2_plugin.settings import declared
+from tiny import make_trainer, parameters, same
+from pathlib import Path
+
+config = D2Config.from_dict({"shrink": {"weight": 0.5}})
+trainer = make_trainer(config, iterations=2)
+trainer.run()
+done = [(entry.step, entry.hook, entry.action) for entry in trainer.d2.trace]
+assert done == [(1, "shrink", "loss"), (2, "shrink", "loss")]
+bare = make_trainer(iterations=2)
+bare.run()
+assert not same(parameters(bare), parameters(trainer))
+assert trainer.d2.state_dict()["hooks"] == {"shrink": {}}
+
+import tomllib
+assert D2Config.from_dict(tomllib.loads(config.to_toml())) == config
+assert {setting.name: setting.help for setting in declared(D2Config)}["shrink"] == "Keeps Gaussians small."
+assert "shrink" in HOOK_NAMES
+run = check(RunSettings("room", ("a",), hooks=("shrink",), overrides={"shrink": {"weight": 2}}))
+assert hook_config(run, Path("p")).shrink.weight == 2.0
+assert for_iterations(["shrink"], 100).hooks == ("shrink",)
+for wrong, sentence in (
+    ({"shrink": {"weight": -1}}, "shrink.weight must be at least 0, got -1"),
+    ({"shrnk": {}}, "unknown hook 'shrnk': have densify, depth_loss, motion, prune, shrink; did you mean 'shrink'?"),
+):
+    try:
+        D2Config.from_dict(wrong)
+    except D2Error as error:
+        assert sentence in str(error), error
+    else:
+        raise AssertionError(wrong)
+"""
+
+
+def test_a_hook_is_added_with_one_file_and_one_row(tmp_path: Path) -> None:
+    example = re.search(r"class,\n\n(.*?)\n\nand the list", hooks.__doc__, re.DOTALL)[1]
+    row = re.search(r'`("shrink": HookRow\(.*?\))`', hooks.__doc__)[1]
+    (tmp_path / "shrink.py").write_text(FILE_OF_THE_HOOK + textwrap.dedent(example))
+    script = SCRIPT.replace("ROW", row)
+    tests = Path(__file__).parents[1]
+    environment = {"PYTHONPATH": f"{tmp_path}:{tests}:{tests.parent}"}
+    subprocess.run([sys.executable, "-c", script], check=True, env=os.environ | environment, timeout=300)

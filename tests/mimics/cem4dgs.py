@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from . import ex4dgs
 from .ex4dgs import Scene, render, training
 from .fastergs4d import product
-from .inria import InriaModel, cameras_of, initial_points
+from .inria import InriaModel, cameras_of, started
 
 __all__ = ["make", "render", "training"]
 
@@ -137,6 +137,4 @@ class GaussianModel(ex4dgs.GaussianModel):
 
 
 def make() -> tuple[GaussianModel, Scene]:
-    gaussians = GaussianModel()
-    gaussians.create_from_pcd(*initial_points())
-    return gaussians, Scene(cameras_of(timestamp=lambda view: view.frame))
+    return started(GaussianModel()), Scene(cameras_of(timestamp=lambda view: view.frame))

@@ -7,20 +7,7 @@ from types import SimpleNamespace
 import torch
 from torch import Tensor, nn
 
-from d2_plugin.rasterizer import Splats
-
-from .inria import (
-    Camera,
-    InriaModel,
-    cameras_of,
-    covariances,
-    default_options,
-    densify,
-    draw,
-    initial_points,
-    l1_loss,
-    shuffled,
-)
+from .inria import InriaModel, Scene, cameras_of, default_options, densify, draw_all, l1_loss, shuffled, started
 
 
 class GaussianModel(InriaModel):
@@ -66,16 +53,6 @@ class DeformModel:
         self.optimizer.param_groups[0]["lr"] *= 0.999
 
 
-class Scene:
-    cameras_extent = 2.0
-
-    def __init__(self, cameras: list[Camera]) -> None:
-        self.cameras = cameras
-
-    def getTrainCameras(self) -> list[Camera]:
-        return self.cameras
-
-
 def render(viewpoint_camera, pc, bg_color, d_xyz, d_rotation, d_scaling, is_6dof=False) -> dict[str, Tensor]:
     """Depth without alpha, as in the repository; the sum of q and d_rotation is not normalised."""
     if is_6dof and torch.is_tensor(d_xyz):
@@ -83,18 +60,13 @@ def render(viewpoint_camera, pc, bg_color, d_xyz, d_rotation, d_scaling, is_6dof
     else:
         means = pc.get_xyz + d_xyz
     rotations = nn.functional.normalize(pc._rotation) + d_rotation
-    cov = covariances(pc.get_scaling + d_scaling, rotations)
-    splats = Splats(means, cov, pc.get_opacity.squeeze(-1), torch.arange(len(means)))
-    package = draw(splats, pc.rgb, viewpoint_camera, len(means), bg_color)
-    del package["alpha"]
+    package = draw_all(pc, viewpoint_camera, bg_color, means, pc.get_scaling + d_scaling, rotations, pc.get_opacity)
     return package | {"viewspace_points_densify": package["viewspace_points"]}
 
 
 def make(is_6dof: bool = False) -> tuple[GaussianModel, DeformModel, Scene]:
-    gaussians = GaussianModel()
-    gaussians.create_from_pcd(*initial_points())
     cameras = cameras_of(fid=lambda view: torch.tensor([view.time]))
-    return gaussians, DeformModel(is_6dof=is_6dof), Scene(cameras)
+    return started(GaussianModel()), DeformModel(is_6dof=is_6dof), Scene(cameras)
 
 
 def training(

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from d2_plugin.rasterizer import RasterSettings, Splats
 
+from . import inria
 from .inria import (
     Camera,
     InriaModel,
@@ -17,9 +18,9 @@ from .inria import (
     default_options,
     densify,
     draw,
-    initial_points,
     l1_loss,
     shuffled,
+    started,
 )
 
 STATIC = (*InriaModel.columns, ("xyz_disp", "_xyz_disp"))
@@ -86,13 +87,6 @@ class GaussianModel(InriaModel):
             self._swap(group, group["params"][0][keep], {key: value[keep] for key, value in moments.items()})
         for name in (*self.accumulated, *self.kept, "max_radii2D"):
             setattr(self, name, getattr(self, name)[~static_mask])
-
-    def cat_tensors_to_optimizer(self, new: dict[str, Tensor]) -> None:
-        for group, moments in self._each_column():
-            if group["name"] in new:
-                rows = new[group["name"]]
-                padded = {key: torch.cat([value, torch.zeros_like(rows)]) for key, value in moments.items()}
-                self._swap(group, torch.cat([group["params"][0], rows]), padded)
 
     def _added(self, columns: tuple[tuple[str, str], ...], values: tuple[Tensor, ...]) -> None:
         self.cat_tensors_to_optimizer({name: value for (name, _), value in zip(columns, values)})
@@ -167,17 +161,15 @@ class GaussianModel(InriaModel):
 _FEATURES = ("_features_dc", "_features_rest")
 
 
-class Scene:
+class Scene(inria.Scene):
     """Cameras of its N3V reader (dataset_readers.py:291): `image_name` is the FRAME's file, the camera is a folder."""
-
-    cameras_extent = 2.0
 
     def __init__(self, cameras: list[Camera]) -> None:
         for camera in cameras:
             name, frame = camera.image_name.split("_")
             camera.image_name = f"{int(frame)}.png"
             camera.image_path = f"/data/scene/{name}/{camera.image_name}"
-        self.cameras = cameras
+        super().__init__(cameras)
 
 
 def opacity_compensation(means: Tensor, cov: Tensor, camera: Camera, kernel: float) -> Tensor:
@@ -214,9 +206,7 @@ def render(viewpoint_camera, pc, bg_color, near=0.2) -> dict[str, Tensor]:
 
 
 def make() -> tuple[GaussianModel, Scene]:
-    gaussians = GaussianModel()
-    gaussians.create_from_pcd(*initial_points())
-    return gaussians, Scene(cameras_of(timestamp=lambda view: view.frame))
+    return started(GaussianModel()), Scene(cameras_of(timestamp=lambda view: view.frame))
 
 
 def training(gaussians: GaussianModel, scene: Scene, opt=None, checkpoint=None, stop: int = 10**9) -> SimpleNamespace:

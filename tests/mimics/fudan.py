@@ -10,7 +10,7 @@ from torch import Tensor
 
 from d2_plugin.gaussians.slicing import slice_gaussians
 
-from .inria import Camera, InriaModel, cameras_of, default_options, densify, draw, initial_points, l1_loss, shuffled
+from .inria import Camera, InriaModel, cameras_of, default_options, densify, draw, l1_loss, shuffled, started
 
 
 class GaussianModel(InriaModel):
@@ -65,9 +65,7 @@ def render(viewpoint_camera: Camera, pc: GaussianModel, bg_color: list[int]) -> 
 
 
 def make() -> tuple[GaussianModel, Scene]:
-    gaussians = GaussianModel()
-    gaussians.create_from_pcd(*initial_points())
-    return gaussians, Scene(cameras_of(timestamp=lambda view: view.time))
+    return started(GaussianModel()), Scene(cameras_of(timestamp=lambda view: view.time))
 
 
 def training(gaussians: GaussianModel, scene: Scene, opt=None, checkpoint=None, stop: int = 10**9) -> SimpleNamespace:

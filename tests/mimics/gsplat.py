@@ -34,8 +34,8 @@ def make() -> tuple[nn.ParameterDict, dict[str, torch.optim.Adam], DefaultStrate
     return splats, optimizers, DefaultStrategy()
 
 
-def change(splats, optimizers, state, parameter_fn, moment_fn) -> None:
-    """Every parameter and its moments."""
+def change(splats, optimizers, state, parameter_fn, moment_fn, state_fn) -> None:
+    """Every parameter, its moments, and every statistic of the strategy."""
     for name in list(splats):
         old, optimizer = splats[name], optimizers[name]
         moments = optimizer.state.pop(old, {})
@@ -46,18 +46,19 @@ def change(splats, optimizers, state, parameter_fn, moment_fn) -> None:
         optimizer.param_groups[0]["params"] = [new]
         optimizer.state[new] = moments
         splats[name] = new
+    for key, value in state.items():
+        if isinstance(value, Tensor):
+            state[key] = state_fn(value)
+
+
+def longer(value: Tensor, count: int) -> Tensor:
+    return torch.cat([value, value.new_zeros(count, *value.shape[1:])])
 
 
 def duplicate(splats, optimizers, state, mask: Tensor) -> None:
     sel = torch.where(mask)[0]
-    change(
-        splats, optimizers, state,
-        lambda name, p: torch.cat([p, p[sel]]),
-        lambda v: torch.cat([v, torch.zeros((len(sel), *v.shape[1:]))]),
-    )  # fmt: skip
-    for key, value in state.items():
-        if isinstance(value, Tensor):
-            state[key] = torch.cat([value, value[sel]])
+    copied = lambda v: torch.cat([v, v[sel]])  # noqa: E731
+    change(splats, optimizers, state, lambda _, p: copied(p), lambda v: longer(v, len(sel)), copied)
 
 
 def split(splats, optimizers, state, mask: Tensor) -> None:
@@ -65,38 +66,29 @@ def split(splats, optimizers, state, mask: Tensor) -> None:
     spread = splats["scales"].detach().exp()[sel]
 
     def halves(name: str, p: Tensor) -> Tensor:
-        repeats = [2] + [1] * (p.dim() - 1)
-        children = p[sel].repeat(repeats)
+        children = twice(p)
         if name == "means":
             children = children + torch.randn(2, len(sel), 3).mul(spread).reshape(-1, 3)
         if name == "scales":
             children = (spread / 1.6).log().repeat(2, 1)
         return torch.cat([p[rest], children])
 
-    change(splats, optimizers, state, halves, lambda v: torch.cat([v[rest], torch.zeros((2 * len(sel), *v.shape[1:]))]))
-    for key, value in state.items():
-        if isinstance(value, Tensor):
-            state[key] = torch.cat([value[rest], value[sel].repeat([2] + [1] * (value.dim() - 1))])
+    def twice(value: Tensor) -> Tensor:
+        return value[sel].repeat([2] + [1] * (value.dim() - 1))
+
+    kept = lambda v: torch.cat([v[rest], twice(v)])  # noqa: E731
+    change(splats, optimizers, state, halves, lambda v: longer(v[rest], 2 * len(sel)), kept)
 
 
 def remove(splats, optimizers, state, mask: Tensor) -> None:
     keep = torch.where(~mask)[0]
-    change(splats, optimizers, state, lambda name, p: p[keep], lambda v: v[keep])
-    for key, value in state.items():
-        if isinstance(value, Tensor):
-            state[key] = value[keep]
+    change(splats, optimizers, state, lambda name, p: p[keep], lambda v: v[keep], lambda v: v[keep])
 
 
 def sample_add(splats, optimizers, state, count: int) -> None:
     """MCMC's way to grow: copies at the end, whose state is zero."""
-    change(
-        splats, optimizers, state,
-        lambda name, p: torch.cat([p, p[:count]]),
-        lambda v: torch.cat([v, torch.zeros((count, *v.shape[1:]))]),
-    )  # fmt: skip
-    for key, value in state.items():
-        if isinstance(value, Tensor):
-            state[key] = torch.cat([value, torch.zeros((count, *value.shape[1:]), dtype=value.dtype)])
+    grown = lambda v: longer(v, count)  # noqa: E731
+    change(splats, optimizers, state, lambda name, p: torch.cat([p, p[:count]]), grown, grown)
 
 
 def relocate(splats, optimizers, state, mask: Tensor) -> None:
@@ -109,10 +101,7 @@ def relocate(splats, optimizers, state, mask: Tensor) -> None:
         p[dead] = p[living]
         return p
 
-    change(splats, optimizers, state, moved, lambda v: v)
-    for value in state.values():
-        if isinstance(value, Tensor):
-            value[living] = 0
+    change(splats, optimizers, state, moved, lambda v: v, lambda v: v.index_fill_(0, living, 0))
 
 
 def render(splats, view) -> SimpleNamespace:

@@ -7,20 +7,8 @@ from types import SimpleNamespace
 import torch
 from torch import Tensor, nn
 
-from d2_plugin.rasterizer import Splats
-
-from .inria import (
-    Camera,
-    InriaModel,
-    cameras_of,
-    covariances,
-    default_options,
-    densify,
-    draw,
-    initial_points,
-    l1_loss,
-    shuffled,
-)
+from . import inria
+from .inria import Camera, InriaModel, cameras_of, default_options, densify, draw_all, l1_loss, shuffled, started
 
 
 class DeformNetwork(nn.Module):
@@ -97,19 +85,14 @@ class GaussianModel(InriaModel):
         super().restore(model_args, training_args)
 
 
-class Scene:
+class Scene(inria.Scene):
     """Cameras that only know their place in the data set; the paths are with the data set."""
-
-    cameras_extent = 2.0
 
     def __init__(self, cameras: list[Camera]) -> None:
         paths = [f"/data/scene/{name[:4]}/images/{name[5:]}.png" for name in (c.image_name for c in cameras)]
         for index, camera in enumerate(cameras):
             camera.image_name, camera.uid = f"{index}", index
         self.train_camera, self.cameras = SimpleNamespace(dataset=SimpleNamespace(image_paths=paths)), cameras
-
-    def getTrainCameras(self) -> list[Camera]:
-        return self.cameras
 
 
 def render(viewpoint_camera, pc, bg_color, stage="fine") -> dict[str, Tensor]:
@@ -119,17 +102,12 @@ def render(viewpoint_camera, pc, bg_color, stage="fine") -> dict[str, Tensor]:
         time = torch.tensor(viewpoint_camera.time).repeat(means.shape[0], 1)
         shs = torch.cat([pc._features_dc, pc._features_rest], 1)
         means, scales, rotations, opacity, _ = pc._deformation(means, scales, rotations, opacity, shs, time)
-    cov = covariances(scales.exp(), nn.functional.normalize(rotations))
-    splats = Splats(means, cov, torch.sigmoid(opacity).squeeze(-1), torch.arange(len(means)))
-    package = draw(splats, pc.rgb, viewpoint_camera, len(means), bg_color)
-    del package["alpha"]
-    return package
+    rotations = nn.functional.normalize(rotations)
+    return draw_all(pc, viewpoint_camera, bg_color, means, scales.exp(), rotations, torch.sigmoid(opacity))
 
 
 def make() -> tuple[GaussianModel, Scene]:
-    gaussians = GaussianModel()
-    gaussians.create_from_pcd(*initial_points())
-    return gaussians, Scene(cameras_of(time=lambda view: view.time))
+    return started(GaussianModel()), Scene(cameras_of(time=lambda view: view.time))
 
 
 def training(gaussians: GaussianModel, scene: Scene, opt=None, checkpoint=None, stop: int = 10**9) -> SimpleNamespace:

@@ -118,6 +118,14 @@ def draw(
     }
 
 
+def draw_all(pc: InriaModel, camera: Camera, bg_color: list[int], means, scales, rotations, opacities) -> dict:
+    """The package of every Gaussian, without alpha, as most of the repositories return it."""
+    splats = Splats(means, covariances(scales, rotations), opacities.squeeze(-1), torch.arange(len(means)))
+    package = draw(splats, pc.rgb, camera, len(means), bg_color)
+    del package["alpha"]
+    return package
+
+
 def l1_loss(image: Tensor, truth: Tensor) -> Tensor:
     return (image - truth).abs().mean()
 
@@ -134,7 +142,7 @@ class InriaModel:
         ("rotation", "_rotation"),
     )
     accumulated = ("xyz_gradient_accum", "denom")
-    scaling_column = 4
+    xyz_column, scaling_column = 0, 4
 
     def __init__(self) -> None:
         self.optimizer, self.percent_dense, self.spatial_lr_scale = None, 0, 1.0
@@ -214,15 +222,15 @@ class InriaModel:
 
     def cat_tensors_to_optimizer(self, new: Mapping[str, Tensor]) -> None:
         for group, moments in self._each_column():
-            rows = new[group["name"]]
-            padded = {key: torch.cat([value, torch.zeros_like(rows)]) for key, value in moments.items()}
-            self._swap(group, torch.cat([group["params"][0], rows]), padded)
+            if group["name"] in new:
+                rows = new[group["name"]]
+                padded = {key: torch.cat([value, torch.zeros_like(rows)]) for key, value in moments.items()}
+                self._swap(group, torch.cat([group["params"][0], rows]), padded)
 
     def densification_postfix(
         self, new_xyz, new_features_dc, new_features_rest, new_opacities, new_scaling, new_rotation
     ) -> None:
-        values = (new_xyz, new_features_dc, new_features_rest, new_opacities, new_scaling, new_rotation)
-        self._append(values)
+        self._append((new_xyz, new_features_dc, new_features_rest, new_opacities, new_scaling, new_rotation))
 
     def _append(self, values: tuple[Tensor | None, ...]) -> None:
         """The evidence of every Gaussian is erased, as in all these repositories."""
@@ -246,7 +254,7 @@ class InriaModel:
         spread = self.get_scaling[chosen].repeat(N, 1)
         offsets = torch.normal(torch.zeros_like(spread), spread)
         rotation = build_rotation(nn.functional.normalize(self._rotation[chosen])).repeat(N, 1, 1)
-        rows[0] = rows[0] + (rotation @ offsets[..., None])[..., 0]
+        rows[self.xyz_column] = rows[self.xyz_column] + (rotation @ offsets[..., None])[..., 0]
         rows[self.scaling_column] = (spread / (0.8 * N)).log()
         self.densification_postfix(*rows)
         self.prune_points(torch.cat([chosen, torch.zeros(N * int(chosen.sum()), dtype=torch.bool)]))
@@ -286,6 +294,16 @@ class InriaModel:
         self.optimizer.load_state_dict(opt_dict)
 
 
+class Scene:
+    cameras_extent = 2.0
+
+    def __init__(self, cameras: list[Camera]) -> None:
+        self.cameras = cameras
+
+    def getTrainCameras(self) -> list[Camera]:
+        return self.cameras
+
+
 def densify(gaussians, opt, iteration: int, gradient: Tensor, seen: Tensor, radii: Tensor, faint=0.005) -> None:
     """What all of them do between backward and the optimizer's step, while they densify."""
     if iteration >= opt.densify_until_iter:
@@ -300,6 +318,12 @@ def initial_points(count: int = 60, seed: int = 0) -> tuple[np.ndarray, np.ndarr
     """Points scattered between the cameras and beyond the plane, with colours."""
     random = np.random.default_rng(seed)
     return random.random((count, 3)) * [3.0, 2.0, 3.0] + [-1.5, -1.0, 1.5], random.random((count, 3))
+
+
+def started(gaussians: InriaModel) -> InriaModel:
+    """With those points."""
+    gaussians.create_from_pcd(*initial_points())
+    return gaussians
 
 
 def shuffled(count: int, epoch: int) -> list[int]:

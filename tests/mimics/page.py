@@ -24,7 +24,7 @@ def added_lines(page: str) -> list[tuple[str, str, str]]:
     return found
 
 
-def attached(mimic: ModuleType, page: str, after_first: str = "") -> ModuleType:
+def attached(mimic: ModuleType, page: str, *after_first: str) -> ModuleType:
     """The mimic with the page's lines in its `training`; `after_first` is code to run after line 1."""
     mimic = sys.modules[mimic.training.__module__]  # cem4dgs is trained by Ex4DGS's loop
     lines = inspect.getsource(mimic).splitlines()
@@ -35,8 +35,7 @@ def attached(mimic: ModuleType, page: str, after_first: str = "") -> ModuleType:
         at = _place(lines, before, after)
         indent = re.match(r" *", lines[at])[0]
         at += lines[at].strip() == before
-        more = [after_first] if added.startswith("d2 = ") and after_first else []
-        lines[at:at] = [indent + line for line in (added, *more)]
+        lines[at:at] = [indent + line for line in (added, *(after_first if added.startswith("d2 = ") else ()))]
     module = ModuleType(f"{mimic.__name__}_attached")
     module.__package__ = mimic.__package__
     sys.modules[module.__name__] = module

@@ -7,20 +7,8 @@ from types import SimpleNamespace
 import torch
 from torch import Tensor, nn
 
-from d2_plugin.rasterizer import Splats
-
-from .inria import (
-    Camera,
-    InriaModel,
-    cameras_of,
-    covariances,
-    default_options,
-    densify,
-    draw,
-    initial_points,
-    l1_loss,
-    shuffled,
-)
+from . import inria
+from .inria import Camera, InriaModel, cameras_of, default_options, densify, draw_all, l1_loss, shuffled, started
 
 
 class GaussianModel(InriaModel):
@@ -80,16 +68,11 @@ class GaussianModel(InriaModel):
             getattr(self, attribute).grad = total / cnt
 
 
-class Scene:
-    cameras_extent = 2.0
-
+class Scene(inria.Scene):
     def __init__(self, cameras: list[Camera]) -> None:
         for camera in cameras:
             camera.image_name = camera.image_name[:4]
-        self.cameras = cameras
-
-    def getTrainCameras(self) -> list[Camera]:
-        return self.cameras
+        super().__init__(cameras)
 
 
 def render(viewpoint_camera, pc, bg_color) -> dict[str, Tensor]:
@@ -99,17 +82,12 @@ def render(viewpoint_camera, pc, bg_color) -> dict[str, Tensor]:
     d = offset.detach()
     motion = pc._motion
     means = pc.get_xyz + motion[:, 0:3] * d + motion[:, 3:6] * d * d + motion[:, 6:9] * d * d * d
-    cov = covariances(pc.get_scaling, nn.functional.normalize(pc._rotation + d * pc._omega))
-    splats = Splats(means, cov, opacity.squeeze(-1), torch.arange(len(means)))
-    package = draw(splats, pc.rgb, viewpoint_camera, len(means), bg_color)
-    del package["alpha"]
-    return package
+    rotations = nn.functional.normalize(pc._rotation + d * pc._omega)
+    return draw_all(pc, viewpoint_camera, bg_color, means, pc.get_scaling, rotations, opacity)
 
 
 def make() -> tuple[GaussianModel, Scene]:
-    gaussians = GaussianModel()
-    gaussians.create_from_pcd(*initial_points())
-    return gaussians, Scene(cameras_of(timestamp=lambda view: view.frame / 2))
+    return started(GaussianModel()), Scene(cameras_of(timestamp=lambda view: view.frame / 2))
 
 
 def training(gaussians: GaussianModel, scene: Scene, opt=None, checkpoint=None, stop: int = 10**9) -> SimpleNamespace:

@@ -7,20 +7,8 @@ from types import SimpleNamespace
 import torch
 from torch import Tensor, nn
 
-from d2_plugin.rasterizer import Splats
-
 from .hust4d import Scene
-from .inria import (
-    InriaModel,
-    cameras_of,
-    covariances,
-    default_options,
-    densify,
-    draw,
-    initial_points,
-    l1_loss,
-    shuffled,
-)
+from .inria import InriaModel, cameras_of, default_options, densify, draw_all, l1_loss, shuffled, started
 
 
 class SpaceTimeHashingField(nn.Module):
@@ -48,6 +36,7 @@ class GaussianModel(InriaModel):
     """The six columns, the logits in an optimizer of their own, and the largest weight of each Gaussian."""
 
     dynamic_thro = 0.0
+    xyz_column, scaling_column = 1, 5
 
     def create_from_pcd(self, points, colors, scale: float = 0.15) -> None:
         super().create_from_pcd(points, colors, scale)
@@ -79,14 +68,6 @@ class GaussianModel(InriaModel):
         rows = super().rows_of(mask, repeat)
         dynamic = self._dynamic.detach()[mask].repeat(repeat, 1)
         return [dynamic, *rows, self._max_weight[mask].repeat(repeat)]
-
-    def densify_and_split(self, grads: Tensor, threshold: float, extent: float, N: int = 2) -> None:
-        """Children in the place of their parent; the base's version knows no dynamic logit before the columns."""
-        padded = torch.zeros(len(self._xyz))
-        padded[: len(grads)] = grads.squeeze()
-        chosen = (padded >= threshold) & (self.get_scaling.amax(1) > self.percent_dense * extent)
-        self.densification_postfix(*self.rows_of(chosen, N))
-        self.prune_points(torch.cat([chosen, torch.zeros(N * int(chosen.sum()), dtype=torch.bool)]))
 
     def prune_points(self, mask: Tensor) -> None:
         self._set_dynamic(self._dynamic.detach()[~mask])
@@ -123,17 +104,13 @@ def render(viewpoint_camera, pc, bg_color, stage="fine") -> dict[str, Tensor]:
         for part, now, whole in zip(raw, moved, final):
             whole[dyn_mask], whole[~dyn_mask] = now, part[~dyn_mask]
         means, scales, rotations, opacity = final
-    cov = covariances(scales.exp(), nn.functional.normalize(rotations))
-    splats = Splats(means, cov, torch.sigmoid(opacity).squeeze(-1), torch.arange(len(means)))
-    package = draw(splats, pc.rgb, viewpoint_camera, len(means), bg_color)
-    del package["alpha"]
+    rotations = nn.functional.normalize(rotations)
+    package = draw_all(pc, viewpoint_camera, bg_color, means, scales.exp(), rotations, torch.sigmoid(opacity))
     return package | {"max_weight_t": package["visibility_filter"].float()}
 
 
 def make() -> tuple[GaussianModel, Scene]:
-    gaussians = GaussianModel()
-    gaussians.create_from_pcd(*initial_points())
-    return gaussians, Scene(cameras_of(time=lambda view: view.time))
+    return started(GaussianModel()), Scene(cameras_of(time=lambda view: view.time))
 
 
 def training(gaussians: GaussianModel, scene: Scene, opt=None, checkpoint=None, stop: int = 10**9) -> SimpleNamespace:

@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import importlib.util
+import os
+import signal
+import sys
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,20 +16,32 @@ import tiny_onnx
 import torch
 from prior_cases import contents, showing
 
-from d2_plugin.errors import D2Error
-from d2_plugin.priors.build import PriorSettings, PriorSummary, build_priors
+from d2_plugin.errors import D2Error, MissingExtra
+from d2_plugin.priors.build import PriorSummary, build_priors
 from d2_plugin.priors.construct import NO_MAP, SCALE_UNKNOWN
+from d2_plugin.priors.dask_build import build_priors_on_cluster
+from d2_plugin.priors.frame import Frame
+from d2_plugin.priors.geometric_source import GeometricSource
 from d2_plugin.priors.monocular.align import align
-from d2_plugin.priors.settings import StereoSettings
+from d2_plugin.priors.settings import PriorSettings, StereoSettings
 from d2_plugin.priors.stereo import matched_depth
+from d2_plugin.priors.stereo.depth_range import DepthBounds
+from d2_plugin.priors.stereo.filtering.filter import GeometricDepth
+from d2_plugin.priors.stereo.geometric_depth import geometric_depth
+from d2_plugin.priors.stereo.reuse import RADIUS, MatchMemory, changed
 from d2_plugin.protocol import Label
-from d2_plugin.recordings.recording import Recording
+from d2_plugin.recordings import open_recording
+from d2_plugin.recordings.export.folder import save_recording
+from d2_plugin.recordings.recording import Camera, Recording
 from d2_plugin.recordings.synthetic.room import synthetic_recording
+from d2_plugin.store.files import write_entry
 from d2_plugin.store.store import PriorStore
 
 pytest.importorskip("cv2")
 
+
 NAMES = ["train0", "train1", "train2"]
+
 SETTINGS = PriorSettings(stereo=StereoSettings(matcher="patchmatch"))
 
 
@@ -318,3 +335,259 @@ def test_mistakes_are_told_before_anything_is_written(
     with pytest.raises(D2Error, match=message):
         build_priors(plain, names, tmp_path / "p", replace(SETTINGS, **change))
     assert not (tmp_path / "p" / "priors").exists()
+
+
+STEREO = StereoSettings(matcher="patchmatch", reuse_block=3)
+
+REUSE = PriorSettings(stereo=STEREO)
+
+STILL_NAMES = ["train0", "train1"]
+
+
+@pytest.fixture(scope="module")
+def still() -> Recording:
+    return synthetic_recording(cameras=2, held_out=0, frames=5, width=128, height=72, arc_degrees=10)
+
+
+@pytest.fixture(scope="module")
+def still_built(still: Recording, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("built") / "priors"
+    build_priors(still, STILL_NAMES, path, REUSE)
+    return path
+
+
+def priors_of(path: Path) -> dict[str, bytes]:
+    return {str(file.relative_to(path)): file.read_bytes() for file in sorted((path / "priors").rglob("*.*"))}
+
+
+def test_a_change_is_what_outlasts_noise_and_its_neighbourhood_changes_with_it() -> None:
+    rng = np.random.default_rng(0)
+    before = np.full((60, 80), 100, np.uint8)
+    noisy = np.clip(before + rng.normal(0, 2, before.shape), 0, 255).astype(np.uint8)
+    assert changed(noisy, before).mean() < 0.02
+    moved = noisy.copy()
+    moved[30:34, 40:44] += 40
+    mask = changed(moved, before)
+    assert mask[30 - RADIUS : 34 + RADIUS, 40 - RADIUS : 44].all()
+    assert not mask[:15].any()
+
+
+def test_a_scene_that_stands_still_is_matched_once() -> None:
+    still = synthetic_recording(cameras=2, held_out=0, frames=2, width=128, height=72, arc_degrees=10, moving=False)
+    memories, results = [MatchMemory(), MatchMemory()], []
+    for frame in still.frames:
+        images = [still.image(name, frame) for name in STILL_NAMES]
+        results.append(geometric_depth(images, list(still.cameras.values()), (2, 9), STEREO, memories=memories))
+    assert [memory.matched_share for memory in memories] == [0, 0]
+    np.testing.assert_array_equal(results[0][0].depth, results[1][0].depth)
+
+
+def test_the_share_that_was_matched_is_recorded_and_small(still_built: Path) -> None:
+    store = PriorStore.open(still_built)
+    shares = [store.record("train0", frame)["stereo"]["matched_share"] for frame in range(5)]
+    assert shares[0] == shares[3] == 1  # blocks of three
+    assert max(shares[1], shares[2], shares[4]) < 0.4
+
+
+def test_carrying_over_does_not_change_what_is_verified_by_much(
+    still: Recording, still_built: Path, tmp_path: Path
+) -> None:
+    full = replace(REUSE, stereo=replace(STEREO, reuse_static=False))
+    build_priors(still, STILL_NAMES, tmp_path, full)
+    results = {}
+    for path in (still_built, tmp_path):
+        store = PriorStore.open(path)
+        errors = []
+        for camera in STILL_NAMES:
+            for frame in (1, 2, 4):
+                truth, prior = still.depth(camera, frame), store.prior(camera, frame)
+                mask = prior.labels.numpy() == Label.VERIFIED
+                errors.append((np.abs(prior.depth.numpy() - truth) / truth)[mask])
+        results[path] = np.concatenate(errors)
+    assert PriorStore.open(tmp_path).record("train0", 1)["stereo"]["matched_share"] == 1
+    carried, matched = results[still_built], results[tmp_path]
+    assert len(carried) > 0.9 * len(matched)
+    assert np.median(carried) < 1.1 * np.median(matched)
+
+
+def test_a_build_that_stopped_within_a_block_goes_on_to_the_same_store(
+    still: Recording, still_built: Path, tmp_path: Path
+) -> None:
+    class Stopped(Exception):
+        pass
+
+    def stop(done: int, total: int, note: str) -> None:
+        if done == 3:
+            raise Stopped
+
+    with pytest.raises(Stopped):
+        build_priors(still, STILL_NAMES, tmp_path, REUSE, progress=stop)
+    build_priors(still, STILL_NAMES, tmp_path, REUSE)
+    assert priors_of(tmp_path) == priors_of(still_built)
+
+
+DASK_NAMES = ["train0", "train1"]
+
+DASK = PriorSettings(stereo=StereoSettings(matcher="patchmatch", reuse_block=2))
+
+needs_dask = pytest.mark.skipif(
+    importlib.util.find_spec("distributed") is None, reason="dask.distributed is not installed"
+)
+
+pytestmark = pytest.mark.filterwarnings("default")  # distributed deprecates its own parts between versions
+
+
+@pytest.fixture(scope="module")
+def shared_room(tmp_path_factory: pytest.TempPathFactory) -> Recording:
+    rendered = synthetic_recording(cameras=2, held_out=0, frames=6, width=128, height=72, arc_degrees=10)
+    return open_recording(save_recording(rendered, tmp_path_factory.mktemp("recording") / "room"))
+
+
+@pytest.fixture(scope="module")
+def alone(shared_room: Recording, tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, bytes], PriorSummary]:
+    """What one process builds."""
+    path = tmp_path_factory.mktemp("alone") / "priors"
+    summary = build_priors(shared_room, DASK_NAMES, path, DASK)
+    return contents(path), summary
+
+
+@pytest.fixture(scope="module")
+def two_workers() -> Iterator[object]:
+    distributed = pytest.importorskip("distributed", reason="dask.distributed is not installed")
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=":0", silence_logs=50
+    ) as cluster:
+        yield cluster
+
+
+def worker_pids(cluster: object) -> list[int]:
+    return sorted(nanny.pid for nanny in cluster.workers.values())
+
+
+@needs_dask
+def test_a_worker_killed_in_the_middle_changes_no_byte_of_the_store(
+    shared_room: Recording, alone: tuple, two_workers: object, tmp_path: Path
+) -> None:
+    before, killed, seen = worker_pids(two_workers), [], []
+
+    def kill_one(done: int, total: int, note: str) -> None:
+        seen.append((done, total))
+        if not killed:
+            killed.append(before[0])
+            os.kill(before[0], signal.SIGKILL)
+
+    store = tmp_path / "priors"
+    summary = build_priors_on_cluster(
+        shared_room, DASK_NAMES, store, DASK, scheduler=two_workers.scheduler_address, progress=kill_one
+    )
+    assert killed
+    assert killed[0] not in worker_pids(two_workers)
+    assert seen[0][0] < 12
+    assert seen[-1] == (12, 12)
+    assert contents(store) == alone[0]
+    assert summary.built + summary.kept == 12
+    assert summary.kept <= 2 * DASK.stereo.reuse_block  # of the part that was begun twice
+    for camera in DASK_NAMES:
+        assert summary.shares[camera] == pytest.approx(alone[1].shares[camera])
+
+
+@needs_dask
+def test_what_a_single_build_refuses_the_cluster_refuses_in_the_same_words(
+    shared_room: Recording, two_workers: object, tmp_path: Path
+) -> None:
+    with pytest.raises(D2Error, match="unknown camera 'train7'.*did you mean"):
+        build_priors_on_cluster(shared_room, ["train7"], tmp_path / "p", DASK, scheduler=two_workers.scheduler_address)
+    with pytest.raises(D2Error, match="no dask scheduler answers at tcp://127.0.0.1:1 "):
+        build_priors_on_cluster(shared_room, DASK_NAMES, tmp_path / "p", DASK, scheduler="tcp://127.0.0.1:1")
+    with pytest.raises(D2Error, match="give at least 1"):
+        build_priors_on_cluster(shared_room, DASK_NAMES, tmp_path / "p", DASK, workers=0)
+
+
+def test_without_dask_its_extra_is_named(
+    shared_room: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(MissingExtra, match=r"dask.distributed, which is not installed: .*d2-4dgs\[cluster\]"):
+        build_priors_on_cluster(shared_room, DASK_NAMES, tmp_path / "p", DASK)
+
+
+CAMERAS = [Camera(name, 7, 5, np.eye(3), np.eye(4)) for name in ("a", "b")]
+
+FRAME = Frame(3, {}, {"a": "image a", "b": "image b"})
+
+BOUNDS = DepthBounds(1e-3, 1e6, "test")
+
+
+class Computed(GeometricSource):
+    """Depths from 1e-3 to 1e6 with holes; of camera b there is none at all."""
+
+    def __init__(self, folder: Path, settings: StereoSettings | None = None, matcher: str = "patchmatch") -> None:
+        super().__init__(CAMERAS, BOUNDS, settings or StereoSettings(), matcher, folder)
+        self.calls = 0
+
+    def _inputs(self, frame: Frame) -> None:
+        return None
+
+    def _computed(self, frame: Frame) -> list[GeometricDepth]:
+        self.calls += 1
+        depth = np.geomspace(1e-3, 1e6, 35).astype(np.float32).reshape(5, 7)
+        depth[2] = 0
+        sigma = np.where(depth > 0, np.float32(0.0123), np.float32(np.inf))
+        none = np.zeros_like(depth)
+        maps = (depth, sigma), (none, np.full_like(sigma, np.inf))
+        return [GeometricDepth(*pair, {"survivors": {"matched": 28}}) for pair in maps]
+
+
+def assert_same(read: dict[str, GeometricDepth], expected: dict[str, GeometricDepth]) -> None:
+    assert read.keys() == expected.keys()
+    for name, depth in expected.items():
+        assert read[name].record == depth.record
+        for map_, other in ((read[name].depth, depth.depth), (read[name].sigma, depth.sigma)):
+            assert map_.dtype == other.dtype
+            np.testing.assert_array_equal(map_, other)
+
+
+def test_the_build_that_computes_sees_what_the_next_one_reads(tmp_path: Path) -> None:
+    first, second = Computed(tmp_path), Computed(tmp_path)
+    depths = first.depths(FRAME)
+    assert_same(second.depths(FRAME), depths)
+    assert (first.calls, second.calls) == (1, 0)
+    assert (depths["a"].depth[0] != first._computed(FRAME)[0].depth[0]).any(), (
+        "codes are coarser than what was computed"
+    )
+
+
+@pytest.mark.parametrize("suffix", [".npy", ".json"])
+def test_files_that_a_power_cut_emptied_are_computed_again(tmp_path: Path, suffix: str) -> None:
+    source = Computed(tmp_path)
+    first = source.depths(FRAME)
+    (tmp_path / "a" / f"00003{suffix}").write_bytes(b"")
+    assert_same(source.depths(FRAME), first)
+    assert source.calls == 2
+
+
+def test_only_what_cannot_be_made_again_waits_for_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    waited: list[int] = []
+    monkeypatch.setattr(os, "fsync", waited.append)
+    Computed(tmp_path).depths(FRAME)
+    assert waited == []
+    write_entry(tmp_path / "kept.npy", np.zeros(3), {})
+    assert len(waited) == 2
+
+
+@pytest.mark.parametrize(
+    ("change", "voids"),
+    [
+        ({"max_pixels": 10_000}, {"patchmatch"}),
+        ({"seed": 1}, {"patchmatch"}),
+        ({"reuse_block": 7}, set()),
+        ({"patchmatch_device": "cpu"}, set()),
+    ],
+)
+def test_maps_are_made_anew_where_a_setting_changed_that_they_depend_on_and_kept_elsewhere(
+    tmp_path: Path, change: dict[str, object], voids: set[str]
+) -> None:
+    settings = replace(StereoSettings(), **change)
+    for matcher in ("patchmatch", "workspace"):
+        key, other = (Computed(tmp_path, chosen, matcher).key(FRAME) for chosen in (None, settings))
+        assert (key != other) == (matcher in voids), matcher

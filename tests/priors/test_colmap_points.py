@@ -17,7 +17,6 @@ from d2_plugin.priors.colmap.points import (
     triangulate_frames,
 )
 from d2_plugin.recordings import open_recording
-from d2_plugin.recordings.cameras.epipolar import sampson
 from d2_plugin.recordings.recording import Recording
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 
@@ -99,16 +98,6 @@ def test_hopeless_input_gives_no_points_and_no_abort(recording: Recording) -> No
 def test_as_many_images_as_cameras_are_wanted(recording: Recording) -> None:
     with pytest.raises(D2Error, match="1 images for 2 cameras"):
         triangulate([recording.image("train0", 0)], [recording.cameras["train0"], recording.cameras["train1"]])
-
-
-def test_epipolar_geometry_holds_for_projected_points(recording: Recording) -> None:
-    first, second = recording.cameras["train0"], recording.cameras["test2"]
-    points = np.random.default_rng(1).uniform([-1, -1, 0], [1, 1, 2], (50, 3))
-    pixels = []
-    for camera in (first, second):
-        projected = (points @ camera.T_camera_world[:3, :3].T + camera.T_camera_world[:3, 3]) @ camera.K.T
-        pixels.append(projected[:, :2] / projected[:, 2:])
-    assert np.abs(sampson(first, second, *pixels)).max() < 1e-9
 
 
 def test_a_missing_pycolmap_names_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:

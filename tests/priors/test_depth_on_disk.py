@@ -1,4 +1,4 @@
-"""Depth on disk: sensor maps and COLMAP workspaces become geometric depth in our units, or are refused by name."""
+"""Depth on disk: sensor maps, confidences and COLMAP workspaces become geometric depth in our units, or are refused."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from prior_cases import write_dense_array
+from oracles.surface import back_project
+from prior_cases import showing, write_dense_array
 
 from d2_plugin.errors import D2Error
 from d2_plugin.priors import depth_on_disk
@@ -18,6 +19,7 @@ from d2_plugin.priors.colmap.workspace import WorkspaceDepth, scale_of_world, se
 from d2_plugin.priors.depth_on_disk import DepthOnDisk, SensorDepth, find_depth_on_disk
 from d2_plugin.priors.frame import Frame
 from d2_plugin.priors.geometry import index_intrinsics
+from d2_plugin.priors.maps_on_disk import planar
 from d2_plugin.priors.settings import PriorSettings, StereoSettings
 from d2_plugin.protocol import Label
 from d2_plugin.recordings.cameras.camera import pinhole
@@ -29,8 +31,11 @@ from d2_plugin.store.store import PriorStore
 
 cv2 = pytest.importorskip("cv2")
 
+
 NAMES = ["train0", "train1", "train2"]
+
 AUTO = StereoSettings()
+
 SENSOR = StereoSettings(matcher="sensor")
 
 
@@ -394,3 +399,97 @@ def test_braces_never_fill_the_memory_or_look_things_up(place: str, tmp_path: Pa
     source = WorkspaceDepth(tmp_path, place, [camera], [0])
     with pytest.raises(D2Error, match="braces around other than frame"):
         source.has_maps(0)
+
+
+ONE = "train0"
+
+
+@pytest.fixture
+def one_sensor(tmp_path: Path) -> Recording:
+    """One camera with a depth sensor and no monocular maps of its own."""
+    room = synthetic_recording(cameras=1, held_out=0, frames=1, width=96, height=54)
+    room = replace(room, path=tmp_path, mono_kind=None)
+    write_map(room, room.depth(ONE, 0), {"scale": 1.0})
+    return room
+
+
+def write_map(room: Recording, depth: np.ndarray, description: dict) -> None:
+    folder = room.path / "depth" / ONE
+    folder.mkdir(parents=True, exist_ok=True)
+    np.save(folder / "00000.npy", depth)
+    (folder.parent / "depth.json").write_text(json.dumps(description))
+
+
+def write_confidence(room: Recording, values: np.ndarray, suffix: str = ".npy") -> None:
+    folder = room.path / "depth_confidence" / ONE
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"00000{suffix}"
+    assert cv2.imwrite(str(path), values) if suffix == ".png" else np.save(path, values) is None
+
+
+def prior_of(room: Recording, settings: PriorSettings | None = None) -> PriorStore:
+    build_priors(room, [ONE], room.path / "store", settings or PriorSettings(stereo=SENSOR))
+    return PriorStore.open(room.path / "store")
+
+
+@pytest.mark.parametrize("suffix", [".npy", ".png"])
+def test_a_sensor_is_as_sure_as_it_says_and_a_pixel_it_does_not_trust_is_no_depth(
+    one_sensor: Recording, suffix: str
+) -> None:
+    before = prior_of(one_sensor).prior(ONE, 0)
+    sure = np.ones((54, 96))
+    sure[:, 30:60], sure[:, 60:] = 0.5, 0
+    write_confidence(one_sensor, np.rint(sure * 65535).astype(np.uint16) if suffix == ".png" else sure, suffix)
+    after = prior_of(one_sensor).prior(ONE, 0)
+    kept = (before.depth > 0).numpy() & (sure > 0)
+    assert kept.any()
+    assert (after.depth.numpy()[:, 60:] == 0).all()
+    assert (after.labels.numpy()[:, 60:] == Label.EMPTY).all()
+    both = kept & (after.depth > 0).numpy()
+    np.testing.assert_allclose(after.depth.numpy()[both], before.depth.numpy()[both], rtol=1e-3)
+    expected = before.sigma.numpy()[both] / sure[both]
+    np.testing.assert_allclose(after.sigma.numpy()[both], expected, rtol=0.05)
+
+
+def test_a_confidence_that_changes_builds_the_prior_anew_and_one_that_does_not_does_not(one_sensor: Recording) -> None:
+    write_confidence(one_sensor, np.ones((54, 96)))
+    settings = PriorSettings(stereo=SENSOR)
+    assert build_priors(one_sensor, [ONE], one_sensor.path / "store", settings).built == 1
+    assert build_priors(one_sensor, [ONE], one_sensor.path / "store", settings).built == 0
+    write_confidence(one_sensor, np.full((54, 96), 0.5))
+    assert build_priors(one_sensor, [ONE], one_sensor.path / "store", settings).built == 1
+
+
+@pytest.mark.parametrize("wrong", [-0.1, 1.5, np.nan])
+def test_a_confidence_outside_of_0_to_1_is_refused_with_its_file(one_sensor: Recording, wrong: float) -> None:
+    write_confidence(one_sensor, np.full((54, 96), wrong))
+    with pytest.raises(D2Error, match=r"depth_confidence.*00000.npy .*a confidence is in 0..1"):
+        prior_of(one_sensor)
+
+
+def test_distances_along_the_ray_become_planar_depth_once(one_sensor: Recording) -> None:
+    truth = one_sensor.depth(ONE, 0)
+    camera = one_sensor.cameras[ONE]
+    distance = np.linalg.norm(back_project(camera, truth) - camera.centre, axis=-1)
+    assert np.abs(distance / truth - 1).max() > 0.05
+    np.testing.assert_allclose(planar(distance, camera), truth, rtol=1e-5)
+    before = prior_of(one_sensor).prior(ONE, 0).depth
+    write_map(one_sensor, distance, {"scale": 1.0, "along": "ray"})
+    np.testing.assert_allclose(prior_of(one_sensor).prior(ONE, 0).depth, before, rtol=1e-3)
+
+
+def test_an_unknown_direction_is_refused(one_sensor: Recording) -> None:
+    write_map(one_sensor, one_sensor.depth(ONE, 0), {"scale": 1.0, "along": "rays"})
+    with pytest.raises(D2Error, match=r"unknown along in .*depth.json 'rays'.*ray"):
+        prior_of(one_sensor)
+
+
+def test_metric_maps_may_measure_along_the_ray_and_relative_ones_may_not(tmp_path: Path) -> None:
+    room = synthetic_recording(cameras=1, held_out=0, frames=1, width=96, height=54)
+    truth, camera = room.depth(ONE, 0), room.cameras[ONE]
+    distance = np.linalg.norm(back_project(camera, truth) - camera.centre, axis=-1).astype(np.float32)
+    metric = showing(room, {"mono": lambda *_: distance}, path=tmp_path, mono_kind="metric")
+    found = prior_of(metric, PriorSettings(mono_along="ray", hanging_limit=0)).prior(ONE, 0).depth
+    np.testing.assert_allclose(found, truth, rtol=1e-3)
+    with pytest.raises(D2Error, match="mono_along = ray needs metric maps"):
+        prior_of(replace(metric, mono_kind="relative"), PriorSettings(mono_along="ray"))

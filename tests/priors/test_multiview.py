@@ -55,6 +55,12 @@ def without(room: Recording, tmp_path_factory: pytest.TempPathFactory) -> PriorS
     return PriorStore.open(path)
 
 
+@pytest.fixture(scope="module")
+def good(room: Recording, maps: Path, tmp_path_factory: pytest.TempPathFactory) -> PriorStore:
+    """The prior of stereo, monocular maps and these."""
+    return build(room, tmp_path_factory.mktemp("good"), SETTINGS, maps)
+
+
 def build(room: Recording, path: Path, settings: PriorSettings, maps: Path) -> PriorStore:
     build_priors(room, NAMES, path, replace(settings, multiview=str(maps)))
     return PriorStore.open(path)
@@ -188,9 +194,9 @@ def test_confidence_counts_by_how_errors_follow_it_in_any_unit(unit: float, powe
 
 
 def test_a_good_source_makes_what_stereo_does_not_know_nearer_to_the_truth_and_declares_it(
-    room: Recording, maps: Path, without: PriorStore, tmp_path: Path
+    room: Recording, good: PriorStore, without: PriorStore
 ) -> None:
-    store = build(room, tmp_path, SETTINGS, maps)
+    store = good
     unmeasured = Label.MONO, Label.AGREED
     assert median_error(room, store, *unmeasured) < 0.7 * median_error(room, without, *unmeasured)
     record = store.record("train0", 1)
@@ -243,7 +249,9 @@ def test_a_source_that_shows_nothing_leaves_the_prior_as_it_is_or_nearly(
 
 
 @pytest.mark.parametrize("factor", [1e-6, 1e6])
-def test_the_unit_of_the_depth_changes_nothing(room: Recording, tmp_path: Path, factor: float) -> None:
+def test_the_unit_of_the_depth_changes_nothing(
+    room: Recording, good: PriorStore, tmp_path: Path, factor: float
+) -> None:
     """Nor does that of the poses, nor of the confidence."""
 
     def scaled(arrays: dict[str, np.ndarray], frame: int) -> None:
@@ -251,12 +259,9 @@ def test_the_unit_of_the_depth_changes_nothing(room: Recording, tmp_path: Path, 
         arrays["conf"] *= np.float32(factor)
         arrays["extrinsics"][..., 3] *= np.float32(factor)
 
-    stores = [
-        build(room, tmp_path / f"p{i}", SETTINGS, write_multiview(room, NAMES, tmp_path / f"m{i}", turned=turned))
-        for i, turned in enumerate((None, scaled))
-    ]
+    other = build(room, tmp_path / "prior", SETTINGS, write_multiview(room, NAMES, tmp_path / "maps", turned=scaled))
     for name in NAMES:
-        one, two = (store.prior(name, 1) for store in stores)
+        one, two = (store.prior(name, 1) for store in (good, other))
         same = (one.labels == two.labels).numpy()
         assert same.mean() > 0.995
         np.testing.assert_allclose(one.depth.numpy()[same], two.depth.numpy()[same], rtol=3e-3)

@@ -153,20 +153,6 @@ def test_sources_at_a_good_angle_come_first_and_useless_ones_not_at_all() -> Non
     assert choose_sources(0, cameras, (3.0, 5.0), replace(SETTINGS, patchmatch_sources=1)) == [3]
 
 
-def test_a_view_that_no_other_meets_has_no_depth_and_spoils_nothing(rig: Rig) -> None:
-    twin = replace(rig.cameras[0], name="twin")
-    pair = [rig.cameras[0], twin]
-    for depth, cost in patchmatch([grays(rig)[0]] * 2, pair, rig.depth_range):
-        assert not depth.any()
-        assert (cost == NO_MATCH).all()
-    away = at(0, facing=-1, name="away")
-    images = [*grays(rig), grays(rig)[0]]
-    away = scaled_camera(away, *images[0].shape[::-1])
-    with_stranger = patchmatch(images, [*rig.cameras, away], rig.depth_range)
-    assert not with_stranger[3][0].any()
-    np.testing.assert_array_equal(with_stranger[0][0], raw(rig)[0][0])
-
-
 def test_images_may_differ_in_size(rig: Rig) -> None:
     small = grays(rig)[1][::1, ::1].reshape(45, 2, 80, 2).mean(axis=(1, 3)).round().astype(np.uint8)
     cameras = [rig.cameras[0], scaled_camera(rig.cameras[1], 80, 45), rig.cameras[2]]

@@ -1,23 +1,29 @@
-"""The declared sigma of monocular depth holds, for good maps and for bad ones, and is infinite where nothing tells."""
+"""Monocular depth beyond its anchors: local correction, and the declared sigma, which holds or is infinite."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 import pytest
 
 from d2_plugin.priors.fuse import FusedPrior, fuse
+from d2_plugin.priors.monocular import correct
 from d2_plugin.priors.monocular.align import align, aligned_depth
-from d2_plugin.priors.monocular.correct import corrected_depth
+from d2_plugin.priors.monocular.correct import corrected_depth, corrected_without
+from d2_plugin.priors.monocular.extrapolation import extrapolation_error
+from d2_plugin.priors.monocular.settings import AlignSettings
 from d2_plugin.priors.monocular.uncertainty import monocular_uncertainty
-from d2_plugin.priors.settings import AlignSettings
 from d2_plugin.protocol import Label
+from d2_plugin.recordings.recording import MonoKind
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 
 cv2 = pytest.importorskip("cv2")
 
+
 SETTINGS = AlignSettings()
+
 SEEDS = range(6)
 
 
@@ -255,3 +261,144 @@ def test_a_map_that_misses_some_things_is_less_sure_everywhere_and_vetoes_less(s
         # Beyond what the scale, the 68 % quantile, says by itself.
         enlarged = np.median(weak.at_anchors[~missed] / good.at_anchors[~missed])
         assert enlarged > 1.3 * weak.skill.scale / good.skill.scale
+
+
+FAR = 12.0
+
+KINDS: tuple[MonoKind, ...] = ("relative", "metric")
+
+
+def bent_scene(kind: MonoKind, bend: float, measured: float = 4.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(aligned map, anchors, true depth): depth 2 to 12 from left to right, anchors where it is below `measured`."""
+    truth = np.tile(np.geomspace(2, FAR, 160), (90, 1))
+    anchors = np.where(truth < measured, truth, 0).astype(np.float32)
+    prediction = (1 / truth if kind == "relative" else truth) ** (1 + bend)
+    fit = align(prediction, anchors, kind=kind, settings=SETTINGS)
+    assert fit.accepted
+    return aligned_depth(prediction, fit, np.inf), anchors, truth
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_map_that_is_a_line_is_sure_everywhere(kind: MonoKind) -> None:
+    aligned, anchors, _ = bent_scene(kind, bend=0.0)
+    assert extrapolation_error(aligned, anchors, kind, SETTINGS).max() < 1e-3
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("bend", [-0.05, 0.05, 0.1])
+def test_of_a_bent_map_it_tells_the_size_of_the_error(kind: MonoKind, bend: float) -> None:
+    aligned, anchors, truth = bent_scene(kind, bend)
+    told = extrapolation_error(aligned, anchors, kind, SETTINGS)
+    assert (told[(truth > 2.2) & (truth < 3.8)] == 0).all(), "between the anchors nothing is extrapolated"
+    row = told[0][(truth[0] > 4) & (aligned[0] > 0)]
+    assert (np.diff(row) >= -1e-9).all(), "the farther beyond, the less sure"
+    beyond = (truth > 6) & (aligned > 0) & np.isfinite(told)
+    error = np.abs(np.log(aligned[beyond] / truth[beyond]))
+    # Lines of thirds part as the distance, the bend goes as its square: three times farther than any anchor, a metric
+    # map is off by more than they tell. Inverse depth has not far to go.
+    least = 0.4 if kind == "relative" else 0.15
+    assert least < np.median(told[beyond] / error) < 2.5
+
+
+def test_a_line_that_turns_around_without_a_third_says_nothing_beyond() -> None:
+    truth = np.tile(np.geomspace(2, FAR, 160), (90, 1))
+    aligned = truth.copy()
+    anchors = np.where(truth < 4, truth, 0)
+    near = (anchors > 0) & (anchors < np.quantile(anchors[anchors > 0], 2 / 3))
+    aligned[near] = 5.0 - truth[near]  # falls where depth rises, but for the farthest third
+    told = extrapolation_error(aligned, anchors, "metric", SETTINGS)
+    assert np.isinf(told[truth > 8]).all()
+
+
+def test_without_anchors_there_is_nothing_to_say() -> None:
+    nothing = np.zeros((9, 16))
+    assert (extrapolation_error(np.ones((9, 16)), nothing, "relative", SETTINGS) == 0).all()
+    assert (extrapolation_error(nothing, np.ones((9, 16)), "relative", SETTINGS) == 0).all()
+
+
+def test_the_declared_sigma_contains_it() -> None:
+    aligned, anchors, truth = bent_scene("relative", 0.1)
+    sigma = monocular_uncertainty(aligned, anchors, SETTINGS).sigma
+    told = extrapolation_error(aligned, anchors, "relative", SETTINGS)
+    beyond = (truth > 6) & (aligned > 0)
+    assert (sigma[beyond] >= told[beyond] * (1 - 1e-5)).all()
+    assert np.median(told[beyond]) > 3 * np.median(sigma[(truth > 2.2) & (truth < 3.8)])
+
+
+SHAPE = (90, 160)
+
+
+def anchored_scene() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """True depth, aligned monocular depth bent by a smooth 8 %, and geometric depth at a third of the pixels."""
+    v, u = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    depth = (3 + u / 80 + (v > 45)).astype(np.float32)
+    bend = 0.08 * np.sin(u / 40 + 1) * np.cos(v / 30)
+    geometric = np.where(np.random.default_rng(0).random(SHAPE) < 0.33, depth, 0).astype(np.float32)
+    return depth, (depth * np.exp(bend)).astype(np.float32), geometric
+
+
+def error_of(estimate: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    return np.abs(estimate - truth) / truth
+
+
+def test_a_smooth_bend_is_undone() -> None:
+    depth, aligned, geometric = anchored_scene()
+    corrected = corrected_depth(aligned, geometric, SETTINGS)
+    assert corrected.dtype == np.float32
+    assert np.median(error_of(corrected, depth)) < 0.15 * np.median(error_of(aligned, depth))
+
+
+def test_pixels_without_anchors_nearby_keep_the_global_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    depth, aligned, geometric = anchored_scene()
+    geometric[:, 40:] = 0
+    monkeypatch.setattr(correct, "SCALES", (0.03,))
+    corrected = corrected_depth(aligned, geometric, SETTINGS)
+    np.testing.assert_allclose(corrected[:, 80:], aligned[:, 80:], rtol=1e-4)
+    assert np.median(error_of(corrected, depth)[:, :35]) < 0.4 * np.median(error_of(aligned, depth)[:, :35])
+
+
+def test_a_patch_of_wrong_anchors_stays_in_conflict() -> None:
+    depth, aligned, geometric = anchored_scene()
+    wrong = np.zeros(SHAPE, bool)
+    wrong[40:46, 70:76] = True
+    geometric = np.where(wrong, depth * 1.25, geometric).astype(np.float32)
+    corrected = corrected_depth(aligned, geometric, SETTINGS)
+    assert (error_of(corrected, depth * 1.25)[wrong] > 0.1).all()
+
+
+def test_empty_stays_empty_and_the_paper_has_no_correction() -> None:
+    _, aligned, geometric = anchored_scene()
+    aligned[:20] = 0
+    corrected = corrected_depth(aligned, geometric, SETTINGS)
+    np.testing.assert_array_equal(corrected > 0, aligned > 0)
+    np.testing.assert_array_equal(
+        corrected_depth(aligned, geometric, replace(SETTINGS, local_correction=False)), aligned
+    )
+    np.testing.assert_array_equal(corrected_depth(aligned, np.zeros_like(geometric), SETTINGS), aligned)
+
+
+def test_a_size_that_no_cell_divides_is_no_special_case() -> None:
+    rng = np.random.default_rng(0)
+    aligned = rng.uniform(2, 4, (37, 641)).astype(np.float32)
+    corrected = corrected_depth(aligned, (1.1 * aligned).astype(np.float32), SETTINGS)
+    np.testing.assert_allclose(corrected, 1.1 * aligned, rtol=0.02)
+
+
+def test_each_choice_of_anchors_is_corrected_as_if_it_were_alone() -> None:
+    _, aligned, geometric = anchored_scene()
+    left_out = np.random.default_rng(1).random((3, *SHAPE)) < np.array([0, 0.5, 1])[:, None, None]
+    corrected = corrected_without(aligned, geometric, left_out, SETTINGS)
+    for index, hole in enumerate(left_out):
+        alone = corrected_depth(aligned, np.where(hole, np.float32(0), geometric), SETTINGS)
+        np.testing.assert_array_equal(corrected[index], alone)
+    np.testing.assert_array_equal(corrected[2], aligned, "without anchors there is no correction")
+    assert (corrected[0] != corrected[1]).any()
+
+
+def test_infinite_and_missing_anchors_change_nothing_around_them() -> None:
+    _, aligned, geometric = anchored_scene()
+    plain = corrected_depth(aligned, geometric, SETTINGS)
+    empty = np.argwhere(geometric == 0)
+    geometric[tuple(empty[0])], geometric[tuple(empty[1])] = np.inf, np.nan
+    np.testing.assert_array_equal(corrected_depth(aligned, geometric, SETTINGS), plain)
+    assert np.isfinite(plain).all()

@@ -85,6 +85,7 @@ def test_times_are_seconds_and_held_out_cameras_have_their_own_file(original: Re
     assert {Path(frame["file_path"]).name.rsplit("_", 1)[0] for frame in test["frames"]} == {held_out}
     assert len(train["frames"]) == 2 * len(original.frames)
     assert train["frames"][1]["time"] == pytest.approx(original.seconds(original.frames[1]))
+    assert any(f"transforms_test.json lists {held_out}" in note for note in open_recording(folder).notes)
 
 
 def test_an_opengl_camera_looks_along_its_negative_z(original: Recording, tmp_path: Path) -> None:

@@ -115,21 +115,6 @@ def n3dv_scene(folder: Path, rows: int, cameras: tuple[int, ...]) -> Path:
     return folder
 
 
-def test_a_camera_without_images_is_left_out_only_when_asked(tmp_path: Path) -> None:
-    path = n3dv_scene(tmp_path / "scene", 3, (0, 5, 9))
-    (path / "cam05" / "0000.png").unlink()
-    with pytest.raises(D2Error, match=r"camera cam05 of .*poses_bounds\.npy has no image"):
-        open_recording(path)
-    recording = open_recording(path, intersect=True)
-    assert {name: camera.centre[0] for name, camera in recording.cameras.items()} == pytest.approx(
-        {"cam00": 0, "cam09": 2},
-        abs=1e-6,  # each keeps its own row
-    )
-    assert "left out, images missing: cam05" in recording.notes
-    with pytest.raises(D2Error, match="camera cam05 .* has no image"):
-        open_recording(path, intersect=True, cameras=["cam05"])
-
-
 def test_of_the_whole_rig_a_few_cameras_are_enough_when_asked(tmp_path: Path) -> None:
     path = n3dv_scene(tmp_path / "scene", 21, (0, 13, 20))
     with pytest.raises(D2Error, match="21 rows for 3 cameras"):

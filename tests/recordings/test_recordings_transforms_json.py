@@ -11,10 +11,7 @@ import pytest
 from stand_in_recordings import refused
 
 from d2_plugin.recordings import open_recording
-from d2_plugin.recordings.export.export import export_recording
 from d2_plugin.recordings.images import read_image, write_png
-from d2_plugin.recordings.recording import Recording
-from d2_plugin.recordings.synthetic.room import synthetic_recording
 
 W, H = 32, 24
 Frames = list[dict]
@@ -45,24 +42,6 @@ def two_by_two(**more: object) -> Frames:
     return [
         entry(f"images/cam{c:02d}_{f:04d}", x=c, time=f / 30, **more) for c in (0, 7) for f in (0, 1)
     ]  # fmt: skip
-
-
-@pytest.fixture(scope="module")
-def original() -> Recording:
-    return synthetic_recording(cameras=2, held_out=1, frames=3, width=W, height=H)
-
-
-@pytest.mark.parametrize("held_out", [(), ("test0",)])
-def test_an_exported_recording_reads_back(original: Recording, tmp_path: Path, held_out: tuple[str, ...]) -> None:
-    found = open_recording(export_recording(original, "transforms", tmp_path / "scene", test_cameras=held_out))
-    assert found.layout == "transforms"
-    assert (set(found.cameras), found.frames, found.fps) == (set(original.cameras), original.frames, original.fps)
-    for name, camera in original.cameras.items():
-        np.testing.assert_allclose(found.cameras[name].K, camera.K, atol=1e-9)
-        np.testing.assert_allclose(found.cameras[name].T_camera_world, camera.T_camera_world, atol=1e-12)
-        for frame in original.frames:
-            np.testing.assert_array_equal(found.image(name, frame), original.image(name, frame))
-    assert any("transforms_test.json lists test0" in note for note in found.notes) == bool(held_out)
 
 
 def test_the_angle_of_view_is_the_focal_length(tmp_path: Path) -> None:

@@ -134,18 +134,18 @@ def test_the_command_trains_shares_priors_and_repeats_nothing(
         synthetic_recording(cameras=3, held_out=1, frames=2, width=96, height=54), tmp_path / "recordings" / "room"
     )
     command = ["ablate", str(recording), "--train-cameras", "train0,train1,train2", "--rows", "main,no_pruning"]
-    command += ["--seeds", "0,1", "--iterations", "20", "--jobs", "1", "--output", str(tmp_path / "out")]
+    command += ["--seeds", "3", "--iterations", "20", "--jobs", "1", "--output", str(tmp_path / "out")]
     assert main(command) == 0
     table = (tmp_path / "out" / "ablation.md").read_text()
     assert "| Backbone |" in table
     assert "| w/o Pruning |" in table
     assert {path.name for path in (tmp_path / "out" / "priors").iterdir()} == {"dual", "dual.seconds.json"}, "one"
     rows = [json.loads(line) for line in (tmp_path / "out" / "runs.jsonl").read_text().splitlines()]
-    assert len(rows) == 6
+    assert len(rows) == 3
     assert all(row["kind"] == "ablation" and row["error"] > 0 for row in rows)
-    assert [row["prior_seconds"] > 0 for row in rows] == [False, False, True, True, True, True]
+    assert [row["prior_seconds"] > 0 for row in rows] == [False, True, True]
     checkpoints = {path: path.stat().st_mtime_ns for path in (tmp_path / "out").rglob("checkpoint.pt")}
-    assert len(checkpoints) == 6
+    assert len(checkpoints) == 3
     assert main(command) == 0
     assert {path: path.stat().st_mtime_ns for path in checkpoints} == checkpoints
     capsys.readouterr()

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from prior_cases import showing
 from torch import Tensor
 
 from d2_plugin.errors import D2Error
@@ -194,17 +195,13 @@ def test_colour_scales_run_from_dark_to_bright() -> None:
 def moving_recording(share: float) -> Recording:
     """Five frames of one camera: noise that stands still, and a white bar that moves over `share` of the rows."""
     still = np.random.default_rng(0).integers(40, 120, (40, 72, 3)).astype(np.uint8)
-    base = synthetic_recording(cameras=3, frames=5, width=72, height=40)
 
-    class Moving(Recording):
-        def image(self, camera: str, frame: int) -> np.ndarray:
-            image = still.copy()
-            image[: round(40 * share), 10 * frame : 10 * frame + 8] = 255
-            return image
+    def image(camera: str, frame: int) -> np.ndarray:
+        image = still.copy()
+        image[: round(40 * share), 10 * frame : 10 * frame + 8] = 255
+        return image
 
-    moving = object.__new__(Moving)
-    moving.__dict__.update(base.__dict__)
-    return moving
+    return showing(synthetic_recording(cameras=3, frames=5, width=72, height=40), {"image": image})
 
 
 def test_what_moves_is_scored_by_itself() -> None:

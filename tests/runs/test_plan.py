@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from prior_cases import showing
 
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.settings import PriorSettings, StereoSettings
@@ -33,47 +34,44 @@ def moving():
     return synthetic_recording(cameras=3, frames=4, width=96, height=54)
 
 
-def test_motion_keeps_the_temporal_dimension(moving) -> None:
-    assert plan_scene(moving, ["train0", "train1"], "maps").uses("temporal")
+PAIR = ["train0", "train1"]
+
+
+@pytest.mark.parametrize(
+    ("frames", "cameras", "maps", "used", "left_out"),
+    [
+        (None, PAIR, "maps", ("temporal", "stereo", "monocular", "verification"), ()),
+        (None, PAIR[:1], "maps", ("temporal",), ("stereo", "verification")),
+        (None, PAIR, None, ("stereo",), ("monocular", "verification")),
+        ([2], PAIR, "maps", ("stereo",), ("temporal",)),
+    ],
+    ids=["all", "one camera", "no monocular depth", "one instant"],
+)
+def test_what_a_scene_does_not_have_is_left_out(moving, frames, cameras, maps, used, left_out) -> None:
+    plan = plan_scene(select_frames(moving, frames) if frames else moving, cameras, maps)
+    assert all(plan.uses(name) for name in used)
+    assert not any(plan.uses(name) for name in left_out)
+    assert frames is None or plan.as_dict()["temporal"] == {"use": False, "reason": "one instant"}
 
 
 def test_no_motion_leaves_the_temporal_dimension_out() -> None:
     still = synthetic_recording(cameras=2, frames=4, width=96, height=54, moving=False)
-    plan = plan_scene(still, ["train0", "train1"], "maps")
-    assert not plan.uses("temporal")
+    assert not plan_scene(still, PAIR, "maps").uses("temporal")
     assert changed_share(still, "train0") == 0
 
 
-def test_one_instant_leaves_the_temporal_dimension_out(moving) -> None:
-    plan = plan_scene(select_frames(moving, [2]), ["train0", "train1"], "maps")
-    assert plan.as_dict()["temporal"] == {"use": False, "reason": "one instant"}
-
-
-def test_one_camera_has_no_stereo_and_no_verification(moving) -> None:
-    plan = plan_scene(moving, ["train0"], "maps")
-    assert not plan.uses("stereo")
-    assert not plan.uses("verification")
-
-
-def test_without_monocular_depth_nothing_is_verified_by_it(moving) -> None:
-    plan = plan_scene(moving, ["train0", "train1"], None)
-    assert plan.uses("stereo")
-    assert not plan.uses("monocular")
-    assert not plan.uses("verification")
-
-
 def test_a_user_may_decide_otherwise_and_the_plan_says_so(moving) -> None:
-    plan = plan_scene(moving, ["train0", "train1"], "maps").override(temporal=False, stereo=None)
+    plan = plan_scene(moving, PAIR, "maps").override(temporal=False, stereo=None)
     assert not plan.uses("temporal")
     assert plan.uses("stereo")
     assert "overridden by the user (measured: motion" in plan.as_dict()["temporal"]["reason"]
 
 
 def test_stereo_left_out_by_the_user_leaves_out_what_follows_from_it(moving) -> None:
-    plan = plan_scene(moving, ["train0", "train1"], "relative maps").override(stereo=False)
+    plan = plan_scene(moving, PAIR, "relative maps").override(stereo=False)
     assert [plan.uses(name) for name in ("stereo", "verification", "monocular")] == [False] * 3
     assert "no geometric depth gives their scale" in plan.as_dict()["monocular"]["reason"]
-    metric = plan_scene(replace(moving, mono_kind="metric"), ["train0", "train1"], "metric maps").override(stereo=False)
+    metric = plan_scene(replace(moving, mono_kind="metric"), PAIR, "metric maps").override(stereo=False)
     assert [metric.uses(name) for name in ("stereo", "verification", "monocular")] == [False, False, True]
 
 
@@ -82,7 +80,7 @@ def test_what_cannot_be_is_not_overridden(moving) -> None:
         plan_scene(moving, ["train0"], None).override(stereo=True)
     twice = replace(moving, cameras=dict.fromkeys(("train0", "train1"), moving.cameras["train0"]))
     with pytest.raises(D2Error, match="all training cameras stand at one point: it takes cameras that stand apart"):
-        plan_scene(twice, ["train0", "train1"], None).override(stereo=True)
+        plan_scene(twice, PAIR, None).override(stereo=True)
 
 
 def camera(name: str, x: float = 0.0, turn: float = 0.0, near_far: tuple[float, float] | None = None) -> Camera:
@@ -139,30 +137,17 @@ def rig(recording: Recording, *cameras: Camera) -> Recording:
 
 def test_cameras_that_share_nothing_have_no_stereo_and_the_reason_says_how_little(moving) -> None:
     apart = rig(moving, camera("a", 0, -90), camera("b", 0.5, 90))
-    plan = plan_scene(apart, ["train0", "train1"], "relative maps")
+    plan = plan_scene(apart, PAIR, "relative maps")
     assert not plan.uses("stereo")
     assert plan.as_dict()["stereo"]["reason"].startswith("no overlap: 2 training cameras, at most 0% of each image")
     assert not plan.uses("verification")
     assert plan.override(stereo=True).uses("verification")
 
 
-class Plain:
-    """Images of one colour."""
-
-    def __init__(self, inner) -> None:
-        self.inner = inner
-
-    def image(self, camera: str, frame: int) -> np.ndarray:
-        return np.full_like(self.inner.image(camera, frame), 90)
-
-    def __getattr__(self, name: str):
-        return getattr(self.inner, name)
-
-
 def test_images_without_texture_have_no_stereo_and_the_reason_says_so(moving) -> None:
-    plain = replace(moving, source=Plain(moving.source))
+    plain = showing(moving, {"image": lambda *view: np.full_like(moving.image(*view), 90)})
     assert measure_texture(plain, ["train0"]) == (0,)
-    plan = plan_scene(plain, ["train0", "train1"], "maps")
+    plan = plan_scene(plain, PAIR, "maps")
     assert not plan.uses("stereo")
     assert plan.as_dict()["stereo"]["reason"].startswith("no texture: 2 training cameras")
     assert plan.as_dict()["stereo"]["reason"].endswith("0% textured")
@@ -170,8 +155,8 @@ def test_images_without_texture_have_no_stereo_and_the_reason_says_so(moving) ->
 
 def test_the_reason_for_stereo_has_the_figures(moving) -> None:
     cameras = (camera("a", near_far=AT_TWO), camera("b", 0.5, near_far=AT_TWO))
-    reason = plan_scene(rig(moving, *cameras), ["train0", "train1"], "maps").as_dict()["stereo"]["reason"]
-    texture = np.mean(measure_texture(moving, ["train0", "train1"]))
+    reason = plan_scene(rig(moving, *cameras), PAIR, "maps").as_dict()["stereo"]["reason"]
+    texture = np.mean(measure_texture(moving, PAIR))
     expected = f"2 training cameras, 75% of each image seen by another, 13 degrees apart, {texture:.0%} textured"
     assert reason == expected.replace("13 degrees", f"{reason.split(', ')[2].split(' ')[0]} degrees")
     assert texture > 0.5
@@ -186,7 +171,7 @@ def test_a_colmap_model_brings_the_points_that_tell_the_depths(moving, tmp_path:
     points = (rays * depth[rows, columns, None] - first.T_camera_world[:3, 3]) @ first.T_camera_world[:3, :3]
     cloud = PointCloud(points, np.full(points.shape, 0.5))
     model = open_recording(export_recording(still, "colmap", tmp_path / "model", cloud=cloud))
-    names = ["train0", "train1"]
+    names = PAIR
     assert "depths unknown" not in plan_scene(model, names, None).as_dict()["stereo"]["reason"]
     assert "depths unknown" in plan_scene(still, names, None).as_dict()["stereo"]["reason"]
 
@@ -214,11 +199,11 @@ def test_a_sensor_is_the_geometric_source_of_one_camera(moving, tmp_path: Path) 
 
 def test_a_sensor_beside_one_of_two_cameras_leaves_stereo(moving, tmp_path: Path) -> None:
     recording = with_sensor(moving, tmp_path, "train0")
-    plan = plan_scene(recording, ["train0", "train1"], None)
+    plan = plan_scene(recording, PAIR, None)
     assert [plan.uses(name) for name in ("sensor", "stereo")] == [False, True]
     assert "does not serve every training camera" in plan.as_dict()["sensor"]["reason"]
     settings = PriorSettings(stereo=StereoSettings(matcher="patchmatch"))
-    assert plan_scene(recording, ["train0", "train1"], None, settings).uses("stereo")
+    assert plan_scene(recording, PAIR, None, settings).uses("stereo")
 
 
 def test_no_stereo_reaches_the_priors(moving, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

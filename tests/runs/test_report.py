@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import xml.etree.ElementTree as ET
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,6 +24,7 @@ from d2_plugin.runs.report.svg import Axis, Plot, Point, Series, figure, number
 from d2_plugin.runs.rows import Row, append_rows, make_row, named_by_cameras, read_rows
 from d2_plugin.runs.saved import METRICS, RUN
 from d2_plugin.runs.settings import RunSettings
+from d2_plugin.runs.tables import Table, markdown, metrics_table
 
 RUNS = Path(__file__).parents[1] / "data" / "runs.jsonl"
 
@@ -169,21 +171,11 @@ def test_a_file_that_no_report_wrote_is_kept(tmp_path: Path, name: str) -> None:
     assert [path.name for path in tmp_path.iterdir()] == [name]
 
 
-def test_what_a_killed_report_left_is_removed_by_the_next(tmp_path: Path) -> None:
-    (tmp_path / ".0123456789abcdef.part").write_text("half a page")
-    for _ in range(2):  # and an earlier report is replaced
-        assert make_report(committed(), tmp_path)[0].is_file()
-    assert not list(tmp_path.glob(".*"))
-
-
 def test_what_names_hold_is_text_and_never_markup(tmp_path: Path) -> None:
     row = scored("yang4d a&b", 0, psnr=20.0) | {"case": "<b>room</b>"}
     page, *_ = make_report([row], tmp_path, [Image("<i>x</i>", "data:image/png;base64,")])
     assert "&lt;b&gt;room&lt;/b&gt;" in page.read_text()
     assert "<i>x" not in page.read_text()
-
-
-# ---------------------------------------------------------------- rows
 
 
 def test_rows_are_appended_and_read_back_with_what_is_not_a_number_as_null(tmp_path: Path) -> None:
@@ -222,9 +214,6 @@ def test_other_cameras_of_one_recording_are_another_case() -> None:
     assert [each["case"] for each in named_by_cameras([row(["00", "07"]), row(["00", "07"])])] == ["plaza, 2 views"] * 2
 
 
-# ---------------------------------------------------------------- run folders
-
-
 def test_a_run_folder_becomes_a_row_with_the_priors_time_beside(tmp_path: Path) -> None:
     row = training_row(write_run(tmp_path / "run"))
     assert (row["case"], row["method"], row["setting"]) == ("den, 2 views", "yang4d + D2", "500 steps, seed 7")
@@ -248,9 +237,6 @@ def test_folders_of_runs_are_searched_and_an_image_of_each_method_is_kept(tmp_pa
     assert page.count("<img ") == 2
     with pytest.raises(D2Error, match="no finished run lies in"):
         collect([tmp_path / "report"])
-
-
-# ---------------------------------------------------------------- plots
 
 
 @given(st.lists(st.floats(1e-16, 1e16), min_size=1, max_size=8), st.booleans())
@@ -279,3 +265,32 @@ def test_marks_lie_inside_the_image_and_carry_their_numbers() -> None:
     assert all(0 < float(c.attrib["cx"]) < width and 0 < float(c.attrib["cy"]) < height for c in circles)
     assert {c[0].text for c in circles} == {"the first", "the <second>"}
     assert drawn.count("stroke-dasharray") == 3, "a bare line is a line in the legend"
+
+
+def scored_run(gaussians: int = 1, **test: float | None) -> dict[str, Any]:
+    return {"test": test, "gaussians": gaussians, "seconds": {"priors": 0.0, "train": 1.25}}
+
+
+def cells(line: str) -> list[str]:
+    return [cell.strip() for cell in line.strip("|").split("|")]
+
+
+def test_a_missing_score_is_a_dash_and_an_unmeasured_column_is_left_out() -> None:
+    table = metrics_table({"a": scored_run(5, psnr=20.0, lpips=None), "b": scored_run(6, psnr=21.5, flicker=0.02)})
+    head, _, first, second = (cells(line) for line in table.splitlines())
+    assert head[:5] == ["run", "PSNR", "SSIM1", "SSIM2", "LPIPS"]
+    assert "depth delta1" not in head
+    assert first[head.index("LPIPS")] == "-"
+    assert first[head.index("flicker")] == "-"
+    assert second[head.index("flicker")] == "0.0200"
+    assert second[-3:] == ["6", "0.0", "1.2"]
+    assert len({len(line) for line in table.splitlines()}) == 1
+
+
+TABLE = Table(("name", "dB"), (("a|b", "28.9 ± 0.5"), ("c", "3")), frozenset({(0, 1)}))
+
+
+def test_markdown_keeps_bars_inside_their_cell_and_stresses_the_best() -> None:
+    assert markdown(TABLE).splitlines() == ["| name | dB |", "| --- | --- |", r"| a\|b | **28.9 ± 0.5** |", "| c | 3 |"]
+    best = Table(("a",), (("1|2",),), frozenset({(0, 0)}))
+    assert markdown(best).splitlines()[-1] == r"| **1\|2** |"

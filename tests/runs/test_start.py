@@ -26,10 +26,6 @@ def surface_points(recording, count: int) -> np.ndarray:
     return (in_camera - camera.T_camera_world[:3, 3]) @ camera.T_camera_world[:3, :3]
 
 
-def test_time_is_in_seconds_since_the_first_frame(recording) -> None:
-    assert make_view(recording, "train1", 2).time == pytest.approx(0.2)
-
-
 def test_kept_images_do_not_grow_with_the_number_of_frames(recording, monkeypatch: pytest.MonkeyPatch) -> None:
     image = 96 * 54 * 3
     monkeypatch.setattr("d2_plugin.runs.start.KEPT_IMAGES", 2 * image)

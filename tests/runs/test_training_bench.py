@@ -1,8 +1,13 @@
-"""`d2 bench training`: equal CPU time, rows as they finish, and a rerun that does only what is missing."""
+"""`d2 bench training`: equal CPU time, rows as they finish, reruns of what lacks; workers end with their parent."""
 
 from __future__ import annotations
 
 import math
+import os
+import signal
+import subprocess
+import sys
+import time
 from collections.abc import Sequence
 from concurrent.futures import Future
 from dataclasses import replace
@@ -20,7 +25,6 @@ from d2_plugin.runs.rows import TRY, Row, make_row
 from d2_plugin.runs.settings import RunSettings
 from d2_plugin.runs.shared import Shared
 from d2_plugin.runs.training.bench import (
-    PILOT,
     TOLERANCE,
     Case,
     Method,
@@ -37,9 +41,6 @@ SETTINGS = RunSettings("room", ("a", "b"))
 
 
 class TestBudget:
-    def test_the_first_try_is_the_pilot(self) -> None:
-        assert next_steps(10, []) == PILOT
-
     @given(law=st.floats(0.9, 1.6), cost=st.floats(1e-3, 1e-1), target=st.floats(5, 200))
     def test_a_power_law_is_met_within_three_tries(self, law: float, cost: float, target: float) -> None:
         tried: list[tuple[int, float]] = []
@@ -54,9 +55,6 @@ class TestBudget:
 
     def test_noise_between_two_near_lengths_does_not_turn_the_law_around(self) -> None:
         assert 100 < next_steps(20, [(100, 10.0), (101, 9.0)]) < 300
-
-    def test_the_nearest_is_so_in_ratio(self) -> None:
-        assert nearest(10, [(1, 5.0), (2, 19.0)]) == 2
 
 
 class TestCases:
@@ -155,3 +153,43 @@ class TestPlan:
         line = line_of(Method(settings, case, Shared(Path("/out"), "dual"), PRESETS["backbone"], "d2"), [])
         with pytest.raises(MemoryError):
             follow([line], broken, lambda row: None)
+
+
+PARENT = """
+import os, time
+from d2_plugin.runs.workers import worker_pool
+
+if __name__ == "__main__":
+    with worker_pool(1) as pool:
+        print(pool.submit(os.getpid).result(), flush=True)
+        pool.submit(time.sleep, 600).result()
+"""
+
+
+def runs(process: int) -> bool:
+    """Whether a process is there and no zombie."""
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks processes up in /proc")
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGTERM])
+def test_a_busy_worker_ends_with_a_parent_that_is_killed(how: signal.Signals, tmp_path: Path) -> None:
+    script = tmp_path / "parent.py"
+    script.write_text(PARENT)
+    with subprocess.Popen([sys.executable, str(script)], stdout=subprocess.PIPE, text=True) as parent:
+        assert parent.stdout is not None
+        worker = int(parent.stdout.readline())
+        assert runs(worker)
+        parent.send_signal(how)
+        parent.wait()
+        for _ in range(100):
+            if not runs(worker):
+                break
+            time.sleep(0.1)
+        alive = runs(worker)
+        if alive:
+            os.kill(worker, signal.SIGKILL)
+        assert not alive

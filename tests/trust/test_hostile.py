@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -20,6 +20,7 @@ pytestmark = pytest.mark.slow
 
 Change = Callable[[Path], object]
 Words = list[str]
+Refused = Callable[..., str]
 
 FLAGS = """
 --densify.scale -1 | --densify.opacity 2 | --densify.budget-per-view -5 | --densify.budget -5
@@ -62,24 +63,6 @@ export-recording ROOM --format nope --output x | ablate ROOM --train-cameras tra
 """
 
 
-def refused(words: Words, capsys: pytest.CaptureFixture[str]) -> str:
-    """What is wrong with the way in which a command line was refused; nothing where one sentence said why."""
-    capsys.readouterr()
-    try:
-        code = main(words)
-    except BaseException as error:  # whatever leaves the boundary of the command line is the fault that is looked for
-        return repr(error)
-    said = [line for line in capsys.readouterr().err.splitlines() if line.startswith("d2: ")]
-    if code != 2 or len(said) != 1:
-        return f"exit code {code}, {said}"
-    return f"it is called our fault: {said[0]}" if "fault of d2" in said[0] else ""
-
-
-def all_refused(cases: Iterable[Words], capsys: pytest.CaptureFixture[str]) -> None:
-    wrong = {" ".join(words): refused(words, capsys) for words in cases}
-    assert {name: found for name, found in wrong.items() if found} == {}
-
-
 def lines(text: str) -> list[Words]:
     return [case.split() for line in text.strip().splitlines() for case in line.split(" | ")]
 
@@ -112,27 +95,30 @@ def place(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_flags(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_flags(recording: Path, tmp_path: Path, refused: Refused) -> None:
     begin = train(recording, tmp_path / "run")
-    all_refused(([*begin, *words] for words in lines(FLAGS)), capsys)
+    for words in lines(FLAGS):
+        refused(*begin, *words)
 
 
-def test_imports(place: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_imports(place: Path, tmp_path: Path, refused: Refused) -> None:
     begin = imported(place, place / "videos", tmp_path / "out")
-    all_refused([[*begin, *words] for words in lines(IMPORTS)], capsys)
+    for words in lines(IMPORTS):
+        refused(*begin, *words)
 
 
-def test_videos(place: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_videos(place: Path, tmp_path: Path, refused: Refused) -> None:
     begin = ["render", str(place / "run"), "--output", str(tmp_path / "a.mp4")]
-    all_refused([[*begin, *words] for words in lines(VIDEOS)], capsys)
+    for words in lines(VIDEOS):
+        refused(*begin, *words)
     assert not list(tmp_path.iterdir())
 
 
-def test_other_commands(place: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_other_commands(place: Path, refused: Refused, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(place)
     named = {"RUN": "run", "VIDEOS": "videos", "ROOM": "room"}
-    cases = [[named.get(word, word).replace("ROOM@", "room@") for word in words] for words in lines(ELSEWHERE)]
-    all_refused(cases, capsys)
+    for words in lines(ELSEWHERE):
+        refused(*(named.get(word, word).replace("ROOM@", "room@") for word in words))
 
 
 def in_its_place(make: Callable[[Path], object]) -> Change:
@@ -156,20 +142,17 @@ DAMAGES: tuple[Change, ...] = (
 )
 
 
-def test_damaged_videos(place: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    cases = []
+def test_damaged_videos(place: Path, tmp_path: Path, refused: Refused) -> None:
     for number, damage in enumerate(DAMAGES):
         videos = shutil.copytree(place / "videos", tmp_path / str(number))
         damage(videos / "train0.mp4")
-        cases.append(imported(place, videos, tmp_path / f"out{number}"))
-    all_refused(cases, capsys)
+        refused(*imported(place, videos, tmp_path / f"out{number}"))
 
 
 @pytest.mark.parametrize("name", ["run.json", "checkpoint.pt"])
-def test_damaged_runs(place: Path, name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    cases = []
+def test_damaged_runs(place: Path, name: str, tmp_path: Path, refused: Refused) -> None:
     for number, damage in enumerate(DAMAGES):
         run = shutil.copytree(place / "run", tmp_path / str(number))
         damage(run / name)
-        cases += [["eval", str(run)], ["export", str(run)], ["render", str(run), "--output", str(tmp_path / "a.mp4")]]
-    all_refused(cases, capsys)
+        for words in (["eval", run], ["export", run], ["render", run, "--output", tmp_path / "a.mp4"]):
+            refused(*words)

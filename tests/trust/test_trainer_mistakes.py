@@ -16,6 +16,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
@@ -23,10 +24,10 @@ from tiny import ALL_HOOKS, TinyStore, make_adapter, make_model, make_views
 from torch import Tensor
 
 from d2_plugin.adapters.yang4d import Yang4DAdapter
-from d2_plugin.config import D2Config, DensifyConfig, DepthLossConfig
+from d2_plugin.config import D2Config, DensifyConfig, DepthLossConfig, PruneConfig
 from d2_plugin.errors import D2Error
 from d2_plugin.plugin import D2Hooks
-from d2_plugin.protocol import DepthPrior, Points
+from d2_plugin.protocol import DepthPrior, Points, Splats, View
 
 VIEWS = make_views()
 
@@ -97,36 +98,40 @@ def test_some_pixels_of_a_prior_that_cannot_be_are_counted_once_per_camera(
     assert caplog.text.count("of 744 pixels labelled with a known depth 1 have NaN") == 1
 
 
-@pytest.mark.parametrize("name", ["zeros", "mirrored", "scaled", "no last row", "K of zeros", "K transposed"])
-def test_a_pose_that_cannot_be_is_refused(name: str) -> None:
-    view, pose, K = VIEWS[0], torch.eye(4), VIEWS[0].K.clone()
-    if name == "zeros":
-        pose = torch.zeros(4, 4)
-    elif name == "mirrored":
-        pose[0, 0] = -1
-    elif name == "scaled":
-        pose[:3, :3] *= 1.1
-    elif name == "no last row":
-        pose[3] = 0
-    elif name == "K of zeros":
-        K[2, 2] = 0
-    else:
-        K[1, 0] = 5
-    with pytest.raises(D2Error, match="is no rotation and shift, or K has"):
-        hooks().loss(1, replace(view, T_camera_world=pose, K=K))
+FIRST = VIEWS[0]
+ODD_TENSORS = (lambda m: m.to("meta"), lambda m: m.to_sparse(), lambda m: m + 0j)
 
 
-@pytest.mark.parametrize("change", [lambda m: m.to("meta"), lambda m: m.to_sparse(), lambda m: m + 0j])
-@pytest.mark.parametrize("name", ["K", "T_camera_world"])
-def test_a_matrix_without_real_numbers_is_refused(name: str, change: Callable[[Tensor], Tensor]) -> None:
-    with pytest.raises(D2Error, match=f"{name} of the view .* expected a plain tensor"):
-        hooks().loss(1, replace(VIEWS[0], **{name: change(getattr(VIEWS[0], name))}))
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        *(({"T_camera_world": pose}, "is no rotation and shift, or K has") for pose in (
+            torch.zeros(4, 4), torch.diag(torch.tensor([-1.0, 1, 1, 1])), torch.diag(torch.tensor([1.1, 1.1, 1.1, 1])),
+            torch.diag(torch.tensor([1.0, 1, 1, 0])))),
+        ({"K": FIRST.K * torch.tensor([[1.0, 1, 1], [1, 1, 1], [1, 1, 0]])}, "is no rotation and shift, or K has"),
+        ({"K": FIRST.K + torch.tensor([[0.0, 0, 0], [5, 0, 0], [0, 0, 0]])}, "is no rotation and shift, or K has"),
+        *(({"K": change(FIRST.K)}, "K of the view .* expected a plain tensor") for change in ODD_TENSORS),
+        *(({"T_camera_world": change(torch.eye(4))}, "world of the view .* a plain tensor") for change in ODD_TENSORS),
+        ({"K": torch.zeros(3, 3)}, "focal lengths 0 and 0, expected positive"),
+        ({"K": torch.full((3, 3), torch.nan)}, "K of the view .* not finite"),
+        ({"K": torch.eye(4)}, r"K of the view .* is torch.float32 \(4, 4\), expected a plain tensor \(3, 3\)"),
+        ({"T_camera_world": None}, r"T_camera_world .* is NoneType, expected a plain tensor \(4, 4\)"),
+        ({"width": 0}, "0x24 pixels, expected at least one"),
+        ({"time": "x"}, "the time of a view must be"),
+        ({"time": math.nan}, "the time of a view must be"),
+        ({"frame": 0.5}, "the frame of a view must be"),
+        ({"camera": None}, "the camera of a view must be"),
+    ],
+)  # fmt: skip
+def test_a_view_that_no_image_has_is_refused(changes: dict[str, object], says: str) -> None:
+    with pytest.raises(D2Error, match=says):
+        hooks().loss(1, replace(FIRST, **changes))
 
 
-@pytest.mark.parametrize(("name", "value"), [("time", "x"), ("time", math.nan), ("frame", 0.5), ("camera", None)])
-def test_what_a_view_is_called_is_looked_at(name: str, value: object) -> None:
-    with pytest.raises(D2Error, match=f"the {name} of a view must be"):
-        hooks().loss(1, replace(VIEWS[0], **{name: value}))
+@pytest.mark.parametrize("views", [None, [None], [FIRST, None], "cam0"])
+def test_what_is_no_view_or_camera_is_refused(views: object) -> None:
+    with pytest.raises(D2Error, match="a str" if views == "cam0" else "got None as a view"):
+        hooks().loss(1, views)
 
 
 def test_a_step_that_falls_repeats_or_differs_is_named_once(caplog: pytest.LogCaptureFixture) -> None:
@@ -149,21 +154,20 @@ def test_a_step_that_falls_repeats_or_differs_is_named_once(caplog: pytest.LogCa
         assert caplog.text.count("which rises from one to the next") == 1
 
 
-@pytest.mark.parametrize("store", [object(), SimpleNamespace(prior=5), TinyStore])
-def test_a_store_without_priors_is_refused(store: object) -> None:
-    with pytest.raises(D2Error, match=r"the store is a \w+ without prior\(camera, frame\)"):
-        hooks(store)
-
-
-@pytest.mark.parametrize("config", [None, 5, {}, D2Config, DensifyConfig()])
-def test_what_is_no_configuration_is_refused(config: object) -> None:
-    with pytest.raises(D2Error, match="config of D2Hooks must be a table of settings"):
-        hooks(config=config)
-
-
-def test_a_class_in_the_place_of_an_adapter_is_refused() -> None:
-    with pytest.raises(D2Error, match=r"the backbone is the class Yang4DAdapter: give an object of it"):
-        hooks(adapter=Yang4DAdapter)
+@pytest.mark.parametrize(
+    ("given", "says"),
+    [
+        *(({"store": store}, r"the store is a \w+ without prior\(camera, frame\)")
+          for store in (object(), SimpleNamespace(prior=5), TinyStore)),
+        *(({"config": config}, "config of D2Hooks must be a table of settings")
+          for config in (None, 5, {}, D2Config, DensifyConfig())),
+        ({"adapter": Yang4DAdapter}, "the backbone is the class Yang4DAdapter: give an object of it"),
+        ({"adapter": object()}, "the backbone is a object without settings, __len__, view, slice_at"),
+    ],
+)  # fmt: skip
+def test_what_is_no_store_configuration_or_backbone_is_refused(given: dict[str, object], says: str) -> None:
+    with pytest.raises(D2Error, match=says):
+        hooks(**given)
 
 
 class Lazy(Yang4DAdapter):
@@ -188,6 +192,89 @@ def test_an_insert_that_does_nothing_is_noticed(said: object, caplog: pytest.Log
     else:
         with pytest.raises(D2Error, match=r"insert\(\) was given .* and returned .*return how many were added"):
             d2.step(1)
+
+
+@pytest.mark.parametrize("name", ["gsplat", "fudan", "yang4d", "hust4d", "deformable3d", "spacetime", "ex4dgs"])
+@pytest.mark.parametrize("model", [(), (object(),), (None, None)], ids=["nothing", "object", "none"])
+def test_an_adapter_of_the_wrong_object_says_so(name: str, model: tuple) -> None:
+    sentence = r"the adapter 'gsplat' cannot take object .*docstring of GsplatAdapter"
+    with pytest.raises(D2Error, match=sentence if (name, len(model)) == ("gsplat", 1) else None):
+        D2Hooks.attach({}, name, *model)
+
+
+def test_a_state_of_other_things() -> None:
+    d2 = hooks()
+    with pytest.raises(D2Error, match="has no hooks, views, generator, idle, retired: give what d2.state_dict"):
+        d2.load_state_dict({})
+    with pytest.raises(D2Error, match="has no hooks"):
+        d2.load_state_dict(None)
+    state = d2.state_dict()
+    other = state | {"hooks": state["hooks"] | {"prune": {"streak": torch.zeros(3, dtype=torch.int64)}}}
+    with pytest.raises(D2Error, match=r"streak of prune in the checkpoint is of 3 Gaussians but the backbone has \d+"):
+        d2.load_state_dict(other)
+    d2.load_state_dict(state)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("views", 5),
+        ("generator", None),
+        ("generator", torch.zeros(3)),
+        ("idle", [1]),
+        ("retired", "x"),
+        ("inserted_at", torch.zeros(2, dtype=torch.int32)),
+        ("hooks", {"densify": {}, "prune": None, "depth_loss": {}}),
+    ],
+)
+def test_a_state_with_something_else_in_it(name: str, value: Any) -> None:
+    d2 = hooks()
+    with pytest.raises(D2Error, match=r"the state of D2 (does not fit|has)|inserted_at of d2 in the checkpoint"):
+        d2.load_state_dict(d2.state_dict() | {name: value})
+
+
+@pytest.mark.parametrize("step", [None, "x", -1, 1.5, True])
+def test_what_is_no_step(step: Any) -> None:
+    d2 = hooks()
+    for call in (lambda: d2.step(step), lambda: d2.loss(step, VIEWS[:1])):
+        with pytest.raises(D2Error, match="as the step: give the number of the optimizer's step"):
+            call()
+
+
+class InFloat64:
+    """A backbone whose Gaussians are float64."""
+
+    def __init__(self) -> None:
+        self.inner = make_adapter(make_model())
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.inner, name)
+
+    def __len__(self) -> int:
+        return len(self.inner)
+
+    def slice_at(self, view: View) -> Splats:
+        return Splats(*(part.double() if part.is_floating_point() else part for part in self.inner.slice_at(view)))
+
+
+def test_densify_says_that_it_needs_float32() -> None:
+    config = D2Config(densify=DensifyConfig(start=0, every=1), views_per_evaluation=1)
+    d2 = hooks(config=config, adapter=InFloat64())
+    d2.loss(1, VIEWS)
+    with pytest.raises(D2Error, match=r"densify inserts float32 Gaussians and slice_at\(\) returned torch.float64"):
+        d2.step(1)
+
+
+def test_gaussians_that_do_not_fit_each_other() -> None:
+    class Torn(InFloat64):
+        def slice_at(self, view: View) -> Splats:
+            splats = self.inner.slice_at(view)
+            return splats._replace(rows=splats.rows[:-1])
+
+    d2 = hooks(config=D2Config(prune=PruneConfig(start=0, every=1)), adapter=Torn())
+    d2.loss(1, VIEWS)
+    with pytest.raises(D2Error, match=r"slice_at\(\) returned means .*, rows .*, expected M rows each"):
+        d2.step(1)
 
 
 @contextmanager

@@ -1,12 +1,15 @@
-"""Pruning: the paper's scores, written out, and what standing in free space adds to them."""
+"""Pruning: the paper's scores, written out, what standing in free space adds, and how much may go at once."""
 
 from __future__ import annotations
 
+import logging
 from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from tiny import (
     ALL_HOOKS,
     HEIGHT,
@@ -21,11 +24,19 @@ from tiny import (
 )
 from torch import Tensor
 
+from d2_plugin.config import D2Config, DensifyConfig, PruneConfig
 from d2_plugin.hooks.hook import FREE_SIGMAS, Context
 from d2_plugin.hooks.prior import PriorLoader
-from d2_plugin.hooks.prune import Prune, PruneConfig, depth_inconsistency, gather, opacity_contribution, pruning_score
+from d2_plugin.hooks.prune import (
+    Prune,
+    depth_inconsistency,
+    gather,
+    opacity_contribution,
+    pruning_score,
+    within_light,
+)
 from d2_plugin.plugin import D2Hooks
-from d2_plugin.protocol import DepthPrior, Label, RasterSettings, Splats, View
+from d2_plugin.protocol import DepthPrior, Edit, Label, RasterSettings, Splats, View
 from d2_plugin.rasterizer import rasterize
 
 EVERY_ONE = PruneConfig(patience=1, light=1)
@@ -126,16 +137,9 @@ def test_a_run_with_the_papers_sigma_is_bitwise_the_run_without_sigma(monkeypatc
     assert same(parameters(runs[0]), parameters(with_term)), "without sigma no space is known to be free"
 
 
-def test_a_survey_without_sigma_has_no_front() -> None:
-    splats, views, prior = scattered(0), [double(view) for view in make_views()[:1]], TinyStore().prior("", 0)
-    for paper in (prior, papers_sigma(prior)):
-        assert not context(splats, views, paper).evaluation[0].survey.front.any(), "the paper knows no free space"
-    measured = prior._replace(sigma=torch.where(prior.trusted, 0.01, torch.inf))
-    assert context(splats, views, measured).evaluation[0].survey.front.any()
-
-
 VERIFIED, UNCERTAIN, BEYOND = 5, 16, 27
 """Columns in the middle of three bands: exact, sigma .2 (free up to 1.2 = 3 (1 - 3 x .2)), far beyond 50."""
+
 CAST = {
     "on the surface": (VERIFIED, 3.0),
     "before the surface": (VERIFIED, 1.5),
@@ -144,6 +148,7 @@ CAST = {
     "before the far": (BEYOND, 10.0),
     "behind the bound": (BEYOND, 60.0),
 }
+
 FLOATING = {"before the surface", "before three sigmas", "before the far"}
 
 
@@ -227,3 +232,81 @@ def test_far_pixels_alone_reach_the_hook_through_the_plugin() -> None:
         d2.step(1)
         left[free_space] = len(model)
     assert left[True] < left[False] == 60
+
+
+def test_the_faintest_go_first_and_the_rest_waits() -> None:
+    weight = torch.tensor([5.0, 1.0, 3.0, 0.5, 90.5])
+    asked = torch.tensor([True, True, True, True, False])
+    assert within_light(asked, weight, 0.05).tolist() == [False, True, True, True, False]
+    assert within_light(asked, weight, 0.02).tolist() == [False, True, False, True, False]
+    assert within_light(asked, weight, 1.0) is asked
+
+
+@settings(deadline=None)
+@given(st.lists(st.tuples(st.booleans(), st.floats(0, 1e3)), min_size=1, max_size=30), st.floats(0, 0.99))
+def test_never_more_than_was_asked_for_and_never_more_light(rows: list[tuple[bool, float]], share: float) -> None:
+    asked, weight = torch.tensor([row[0] for row in rows]), torch.tensor([row[1] for row in rows])
+    chosen = within_light(asked, weight, share)
+    assert not (chosen & ~asked).any()
+    assert bool(chosen.any()) == bool(asked.any())
+    assert int(chosen.sum()) <= 1 or weight[chosen].double().sum() <= share * weight.double().sum() + 1e-6
+
+
+def test_the_hook_removes_little_by_little() -> None:
+    """With a threshold that condemns everything that is seen."""
+
+    def after_three(light: float) -> int:
+        prune = PruneConfig(start=1, every=1, patience=1, tau_p=0.0, light=light)
+        trainer = make_trainer(D2Config(prune=prune, views_per_evaluation=3))
+        trainer.run(until=3)
+        return trainer.d2.log.removed
+
+    assert 0 < after_three(0.05) < after_three(1.0)
+
+
+def test_short_runs_leave_time_between_removals() -> None:
+    """Holes close, and what is misplaced moves, at a pace that counts iterations, not parts of the run."""
+    assert all(PruneConfig.for_iterations(length).every >= 10 for length in (10, 20, 40, 150, 199))
+
+
+CONFIG = D2Config(densify=DensifyConfig(start=1, every=1), prune=PruneConfig(start=1, every=1), retire_after=0)
+
+
+def hooks_that_remove(masks: dict[str, torch.Tensor], **settings: float) -> tuple[D2Hooks, torch.Tensor]:
+    """Hooks that ask for these rows to go, and the positions before."""
+    model = make_model(count=40)
+    d2 = D2Hooks(replace(CONFIG, **settings), make_adapter(model), TinyStore())
+    for name, mask in masks.items():
+        d2.hooks[name].edit = lambda context, mask=mask: Edit(remove=mask)
+    return d2, model.gaussians["positions"].detach().clone()
+
+
+@pytest.mark.parametrize(("settings", "gone"), [({}, 36), ({"remove_at_most": 1}, 40)], ids=["default", "no limit"])
+def test_some_stay_by_default_whatever_is_asked_for(settings: dict[str, float], gone: int) -> None:
+    d2, _ = hooks_that_remove({"prune": torch.ones(40, dtype=torch.bool)}, **settings)
+    assert d2.step(1).removed == gone
+
+
+def test_what_stays_is_spread_over_the_rows_and_it_is_said(caplog: pytest.LogCaptureFixture) -> None:
+    d2, before = hooks_that_remove({"prune": torch.ones(40, dtype=torch.bool)}, remove_at_most=0.5)
+    with caplog.at_level(logging.WARNING):
+        assert d2.step(1).removed == 20
+    assert "the hooks would remove 40 of 40 Gaussians, and at most 20 go in one step (remove_at_most)" in caplog.text
+    kept = d2.backbone.model.gaussians["positions"]
+    assert torch.equal(kept, before[1::2]), "spread over the rows, not the first half of them"
+
+
+def test_hooks_together_stay_below_it() -> None:
+    rows = torch.arange(40)
+    d2, _ = hooks_that_remove({"densify": rows < 15, "prune": rows >= 30}, remove_at_most=0.25)
+    assert d2.step(1).removed == 10
+    counts = {trace.hook: trace.count for trace in d2.trace if trace.action == "remove"}
+    assert counts == {"densify": 6, "prune": 4}
+
+
+def test_what_is_less_goes_as_it_was_asked_for() -> None:
+    rows = torch.arange(40)
+    for share in (0.5, 0.9, 1.0):
+        d2, before = hooks_that_remove({"prune": rows % 3 == 0}, remove_at_most=share)
+        assert d2.step(1).removed == 14
+        assert torch.equal(d2.backbone.model.gaussians["positions"], before[rows % 3 != 0])

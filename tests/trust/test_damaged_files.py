@@ -1,0 +1,314 @@
+"""Every file that is read, damaged at random: a valid result or one sentence, in bounded time and memory.
+
+Of what the plugin itself keeps a valid result is the one that was written.
+"""
+
+from __future__ import annotations
+
+import json
+import random
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+import torch
+from calibration_writers import CASES as CALIBRATIONS
+from calibration_writers import rig
+from fuzzing import SEED, bounded_memory, expect_result_or_sentence, leaves, mutate_file
+from prior_cases import write_dense_array
+from small_layouts import small_recording, write_layout
+from tiny_onnx import mean_network
+
+from benchmarks.report import EVERY
+from d2_plugin.arrays import read_array
+from d2_plugin.config import D2Config, for_iterations
+from d2_plugin.durable import write_table
+from d2_plugin.priors.colmap.workspace import read_dense_array
+from d2_plugin.priors.depth_on_disk import SensorDepth
+from d2_plugin.priors.fuse import FusedPrior
+from d2_plugin.priors.monocular.network import MonocularModel
+from d2_plugin.protocol import EXPORT_FILE, Label
+from d2_plugin.reading import read_json
+from d2_plugin.recordings import open_recording
+from d2_plugin.recordings.cameras.calibration import read_calibration
+from d2_plugin.recordings.cameras.formats.colmap import find_model, read_points
+from d2_plugin.recordings.export.export import export_recording
+from d2_plugin.recordings.images import image_size, read_image, write_png
+from d2_plugin.recordings.importing.video import VideoFrames, read_video
+from d2_plugin.recordings.recording import Camera
+from d2_plugin.runs.report.report import collect, make_report
+from d2_plugin.runs.saved import METRICS, RUN, load_checkpoint, read_metrics, read_run, save_checkpoint
+from d2_plugin.runs.start import TimedPoints
+from d2_plugin.store.exported import RenamedStore
+from d2_plugin.store.store import PriorStore
+from d2_plugin.viewing.camera_paths import read_camera_path
+from d2_plugin.viewing.checkpoints import read_ply
+
+cv2 = pytest.importorskip("cv2", reason="opencv is in the `image` extra")
+pytest.importorskip("yaml", reason="pyyaml is in the `calibration` extra")
+pytest.importorskip("pycolmap", reason="pycolmap is in the `calibration` extra")
+pytest.importorskip("av", reason="PyAV is in the `video` extra")
+
+MANY = 2000
+MAP = np.linspace(0.5, 3, 48 * 32, dtype=np.float32).reshape(32, 48)
+IMAGE = (np.stack([MAP, MAP[::-1], MAP * 0.3], axis=-1) * 80).astype(np.uint8)
+LAYOUTS = ("folder", "n3dv", "videos", "technicolor", "enerf", "transforms", "colmap", "colmap_text")
+IMAGES = (".png", ".mp4")
+
+
+class Case(NamedTuple):
+    """A file, how it is written and how it is read."""
+
+    file: str
+    write: Callable[[Path], object]
+    read: Callable[[Path], Any]
+
+
+def sensor(path: Path) -> np.ndarray | None:
+    camera = Camera("cam00", 48, 32, np.diag([40.0, 40, 1]), np.eye(4))
+    return SensorDepth(path.parent if path.name == "depth.json" else path.parent.parent, ["cam00"]).depth(camera, 0)
+
+
+def write_sensor(path: Path) -> None:
+    folder = path.parent if path.name == "depth.json" else path.parent.parent
+    (folder / "cam00").mkdir(parents=True, exist_ok=True)
+    (folder / "depth.json").write_text('{"unit": "mm"}')
+    if path.suffix == ".npy":
+        np.save(path, MAP * 1000)
+    else:
+        cv2.imwrite(str(folder / "cam00" / "0.png"), (MAP * 1000).astype(np.uint16))
+
+
+def report(path: Path) -> object:
+    rows, images = collect([path])
+    return make_report(rows, path.parent / "report", images, EVERY)
+
+
+def some_rows() -> list[str]:
+    """Two rows of each kind: a report of all of them takes a while."""
+    found: dict[str, list[str]] = {}
+    for line in (Path(__file__).parents[1] / "data" / "runs.jsonl").read_text().splitlines(keepends=True):
+        found.setdefault(json.loads(line)["kind"], []).append(line)
+    return [line for lines in found.values() for line in lines[:2]]
+
+
+def network(path: Path) -> np.ndarray:
+    return MonocularModel(path, "relative")(IMAGE)
+
+
+def video(path: Path) -> np.ndarray:
+    return VideoFrames({"a": read_video(path)}).image("a", 1)
+
+
+def write_video(path: Path) -> None:
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), 24, (48, 32))
+    for _ in range(3):
+        writer.write(IMAGE)
+    writer.release()
+
+
+def write_camera_path(path: Path) -> None:
+    pose = {"camera_to_world": np.eye(4).ravel().tolist(), "fov": 50.0, "aspect": 1.5, "render_time": 0.5}
+    table = {"camera_type": "perspective", "render_height": 54, "render_width": 96, "camera_path": [pose, pose]}
+    path.write_text(json.dumps({**table, "fps": 24, "seconds": 2}))
+
+
+def write_cloud(path: Path) -> None:
+    names = ["x", "y", "z", "opacity", "scale_0", "rot_0", "f_dc_0"]
+    head = ["ply", "format binary_little_endian 1.0", "element vertex 5", *(f"property float {n}" for n in names)]
+    path.write_bytes("\n".join([*head, "end_header\n"]).encode() + np.zeros((5, 7), np.float32).tobytes())
+
+
+CASES = {
+    "camera path": Case("camera_path.json", write_camera_path, read_camera_path),
+    "point cloud": Case("cloud.ply", write_cloud, read_ply),
+    "json": Case("a.json", lambda p: p.write_text(json.dumps({"a": [1, {"b": 2.5}], "c": "d"})), read_json),
+    "toml": Case(
+        "d2.toml",
+        lambda p: p.write_text(for_iterations(("densify", "prune", "depth_loss"), 100).to_toml()),
+        D2Config.from_toml,
+    ),
+    "npy": Case("a.npy", lambda p: np.save(p, MAP), read_array),
+    "npz": Case("a.npz", lambda p: np.savez_compressed(p, depth=MAP), lambda p: read_array(p, key="depth")),
+    "png": Case("a.png", lambda p: write_png(p, IMAGE), lambda p: (image_size(p), read_image(p))),
+    "jpeg": Case("a.jpg", lambda p: cv2.imwrite(str(p), IMAGE), lambda p: (image_size(p), read_image(p))),
+    "video": Case("a.mp4", write_video, video),
+    "dense": Case("a.bin", lambda p: write_dense_array(p, MAP), read_dense_array),
+    "sensor json": Case("depth.json", write_sensor, sensor),
+    "sensor npy": Case("depth/cam00/0.npy", write_sensor, sensor),
+    "sensor png": Case("depth/cam00/0.png", write_sensor, sensor),
+    "rows": Case(
+        "runs.jsonl",
+        lambda p: p.write_text("".join(some_rows())),
+        report,
+    ),
+    "export": Case(
+        f"export/{EXPORT_FILE}",
+        lambda p: export_recording(small_recording(), "transforms", p.parent),
+        lambda p: RenamedStore.of_export(None, p.parent),
+    ),
+    "onnx": Case("net.onnx", lambda p: mean_network(p, 32, 48), network),
+}
+
+
+def layout(path: Path, name: str) -> Callable[[], object]:
+    """A function that opens a small recording and reads what its cameras have."""
+    write_layout(name, path)
+
+    def read() -> object:
+        recording = open_recording(path)
+        for camera in recording.cameras:
+            for frame in recording.frames[:2]:
+                recording.image(camera, frame)
+                recording.depth(camera, frame)
+                recording.mono(camera, frame)
+        model = find_model(path)
+        return read_points(model) if model is not None else recording
+
+    return read
+
+
+def calibration(path: Path, name: str) -> Callable[[], object]:
+    """A function that reads a calibration of one format."""
+    path.mkdir()
+    case = CALIBRATIONS[name]
+    cameras = rig(case.coefficients, case.fisheye, case.names)
+    file = case.write(path, cameras)
+    sizes = None if case.sizes else {camera.name: camera.size for camera in cameras}
+    return lambda: [camera.lens.bends for camera in read_calibration(file, sizes)]
+
+
+def a_store(folder: Path) -> tuple[Path, Callable[[], Any]]:
+    labels = np.full((9, 12), Label.VERIFIED, np.uint8)
+    maps = FusedPrior(
+        np.linspace(1, 4, 108, dtype=np.float32).reshape(9, 12),
+        labels,
+        np.full((9, 12), 0.02, np.float32),
+        np.zeros((9, 12, 3), np.uint8),
+    )
+    store = PriorStore.create(folder / "store", ["a", "b"], [0], {"recording": "room"})
+    for camera in ("a", "b"):
+        store.write(camera, 0, maps, {"key": "k", "shares": maps.shares(), "refused": ""})
+
+    def read() -> Any:
+        opened = PriorStore.open(folder / "store")
+        return [list(opened.cameras), [[opened.prior(c, 0), opened.record(c, 0)] for c in opened.cameras]]
+
+    return store.path, read
+
+
+def in_store(*name: str) -> Callable[[Path], tuple[Path, Callable[[], Any]]]:
+    """One file of a prior store."""
+
+    def file(folder: Path) -> tuple[Path, Callable[[], Any]]:
+        path, read = a_store(folder)
+        return path.joinpath(*name), read
+
+    return file
+
+
+def checkpoint(folder: Path) -> tuple[Path, Callable[[], Any]]:
+    path = folder / "checkpoint.pt"
+    state = {"step": 7, "model": {"positions": torch.randn(20, 3), "on": True}, "seconds": {"train": 1.5}}
+    save_checkpoint(path, state)
+    return path, lambda: load_checkpoint(path, "cpu")
+
+
+def points(folder: Path) -> tuple[Path, Callable[[], Any]]:
+    path, draw = folder / "points.npz", np.random.default_rng(0)
+    TimedPoints(draw.random((8, 3)), draw.random((8, 3)), draw.random(8)).save(path)
+
+    def read() -> Any:
+        found = TimedPoints.load(path)
+        return [found.positions, found.colors, found.times]
+
+    return path, read
+
+
+def run_table(folder: Path) -> tuple[Path, Callable[[], Any]]:
+    write_table(folder / "run.json", {"recording": "/x", "seed": 3, "overrides": {"d2": {"seed": 1}}}, RUN)
+    return folder / "run.json", lambda: read_run(folder)
+
+
+def scores(folder: Path) -> tuple[Path, Callable[[], Any]]:
+    table = {"test": {"psnr": 25.5}, "seconds": {"train": 1.0}, "gaussians": 3, "iterations": 4, "recording": "room"}
+    table |= {"train_cameras": ["a"], "backbone": "b", "hooks": [], "made": {"commit": "c"}}
+    write_table(folder / "metrics.json", table, METRICS)
+    return folder / "metrics.json", lambda: read_metrics(folder)
+
+
+FILES = {
+    "store": in_store("store.json"),
+    "record": in_store("priors", "a", "00000.json"),
+    "prior": in_store("priors", "b", "00000.npy"),
+    "checkpoint": checkpoint,
+    "points": points,
+    "run": run_table,
+    "scores": scores,
+}
+"""What the plugin keeps: each makes a file in a folder, and returns it and what reads it."""
+
+
+class Damage(NamedTuple):
+    """What is damaged, how often in the short round, and how it is read."""
+
+    read: Callable[[], Any]
+    files: list[Path]
+    few: int
+    kept: bool = False
+
+
+def of_case(folder: Path, name: str) -> Damage:
+    case = CASES[name]
+    path = folder / case.file
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if name == "export":
+        path.parent.rmdir()
+    case.write(path)
+    return Damage(lambda: case.read(path), [path], 10 if name == "rows" else 50)  # a report takes a while
+
+
+def of_folder(written: Callable[[Path, str], Callable[[], object]], folder: Path, name: str) -> Damage:
+    """Two in three times a file that is no image."""
+    read = written(folder / "files", name)
+    files = sorted(file for file in (folder / "files").rglob("*") if file.is_file())
+    plain = [file for file in files if file.suffix not in IMAGES]
+    return Damage(read, files + plain * (2 * len(files) // len(plain)), 20)
+
+
+def of_kept(folder: Path, name: str) -> Damage:
+    path, read = FILES[name](folder)
+    return Damage(read, [path], 40, True)
+
+
+TABLE = [
+    *((of_case, name) for name in CASES),
+    *((partial(of_folder, layout), name) for name in LAYOUTS),
+    *((partial(of_folder, calibration), name) for name in CALIBRATIONS),
+    *((of_kept, name) for name in FILES),
+]
+
+
+@pytest.mark.parametrize("many", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("written", "name"), TABLE, ids=[name for _, name in TABLE])
+def test_a_damaged_file_is_valid_or_one_sentence(
+    written: Callable[[Path, str], Damage], name: str, many: bool, tmp_path: Path
+) -> None:
+    if name == "onnx":
+        pytest.importorskip("onnxruntime", reason="onnxruntime is in the `mono` extra")
+    read, files, few, kept = written(tmp_path, name)
+    whole = read()
+    expected = leaves(whole) if kept else None
+    count, seed, valid = (MANY, SEED, 0) if many else (few, 0, 0)
+    with bounded_memory():
+        for number in range(count):
+            rng = random.Random(f"{name} {seed} {number}")
+            path = rng.choice(files)
+            before = path.read_bytes()
+            mutate_file(path, rng)
+            valid += expect_result_or_sentence(read, f"{name} {seed} {number} {path.name}", expected)
+            path.write_bytes(before)
+    assert valid < (count / 2 if kept else count), "hardly a mutation did any harm: the test would not notice"
