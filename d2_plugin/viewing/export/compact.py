@@ -1,8 +1,8 @@
 """Fewer Gaussians in an export: those that the training images would miss least are removed, the others train on.
 
 Without Gaussian k a pixel differs by o_k dC/do_k, since its colour C is affine in every opacity. The energy of that
-difference, summed over an image, is the mean of (o_k d<s, C>/do_k)^2 over images s of random signs (Hutchinson 1990): one
-backward pass for a view, for all Gaussians together. Speedy-Splat (Hanson et al. 2025) prunes by a similar sum.
+difference, summed over an image, is the mean of (o_k d<s, C>/do_k)^2 over images s of random signs (Hutchinson 1990):
+one backward pass for a view, for all Gaussians together. Speedy-Splat (Hanson et al. 2025) prunes by a similar sum.
 """
 
 from __future__ import annotations

@@ -40,8 +40,8 @@ class Export(Settings):
     frames: tuple[Count, ...] | None = None
     """first:last or first:last:step, the last one included, of a file for each frame; all frames if not given."""
     keep: Annotated[float, Range(0, 1, open_low=True)] = 1.0
-    """Share of the Gaussians that is kept: those that training images would miss least go, the others train on for a few
-    hundred steps. What that costs is measured and said."""
+    """Share of the Gaussians that is kept: those that training images would miss least go, the others train on for a
+    few hundred steps. What that costs is measured and said."""
     recording: Path | None = None
     """The recording of a checkpoint of an official trainer."""
     train_cameras: tuple[str, ...] | None = None
@@ -70,7 +70,7 @@ def run(settings: Export) -> str:
     paths, notes = write_export([export_scene(viewed) for viewed in shown], settings, output)
     what = f"{len(paths)} files in {paths[0].parent}" if len(paths) > 1 else str(paths[0])
     size = sum(path.stat().st_size for path in paths) / 1e6
-    return "\n".join([f"{what} ({size:.1f} MB)", *(viewed.note for viewed in shown if viewed.note), *notes])
+    return "\n".join([f"{what} ({size:.1f} MB)", *notes])
 
 
 def write_export(scenes: list[ExportScene], settings: Export, folder: Path) -> Written:
@@ -84,6 +84,7 @@ def write_export(scenes: list[ExportScene], settings: Export, folder: Path) -> W
             paths, notes = [folder / "scene.4dgs"], write_4dgs(scene, folder / "scene.4dgs")
         else:
             paths, notes = _frame_files(scene, settings, folder / settings.format), []
+    notes = [*scene.viewed.note.splitlines(), *notes]
     if scene.background is not None:
         notes = [*notes, "the background behind the Gaussians is left out: the format has no place for it, html has"]
     return paths, notes
