@@ -33,7 +33,7 @@ BLOCK = 256
 MARGINAL_REACH = math.sqrt(-2 * math.log(MARGINAL_CUT))
 """Standard deviations from mu_t at which a Gaussian is cut off: F = `MARGINAL_CUT`."""
 LOOK_BITS = 8
-"""Of shapes and colours: images then differ by less than the bytes of a screen do (docs/evidence.md)."""
+"""Of shapes and colours: images then differ by about what the bytes of a screen round (docs/evidence.md)."""
 
 
 class Coded(NamedTuple):
