@@ -78,6 +78,8 @@ def test_the_page_shows_what_the_rasterizer_draws(new_page: Any, tmp_path: Path,
 
 def test_in_an_image_of_more_pixels_the_blur_is_of_the_recordings(new_page: Any, tmp_path: Path) -> None:
     model = sharp_model("yang4d")
+    with torch.no_grad():
+        model.gaussians["log_scales"][:, 1:] -= 3  # thinner than a pixel
     page = opened(new_page, model, tmp_path / "scene.html")
     script = """async (name) => {
         const p = await d2, free = new FreeCamera(p.header), camera = p.header.cameras.find((c) => c.name === name);
