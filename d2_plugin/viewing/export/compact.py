@@ -37,7 +37,8 @@ def compacted(viewed: ViewedRun, keep: float) -> ViewedRun:
     Raises:
         D2Error: a checkpoint of another trainer.
     """
-    backbone, model = viewed.backbone, getattr(viewed.backbone, "model", None)
+    backbone: Any = viewed.backbone
+    model: Any = getattr(backbone, "model", None)
     if not hasattr(model, "optimize"):
         raise D2Error(f"--keep trains what it keeps, and {viewed.name} is no run of `d2 train`: leave out --keep")
     frames = TrainingFrames(viewed.recording, viewed.train_cameras, viewed.device, viewed.background_weight)
@@ -59,8 +60,8 @@ def compacted(viewed: ViewedRun, keep: float) -> ViewedRun:
             photometric_loss(color, frames.image_bytes(index), weights=frames.weights(index)).backward()
             model.optimize(steps + step, 2 * steps)  # positions as slowly as in the second half of a run
             bar.update(step)
-    after, note = _scores(viewed, viewed.train_cameras)[""], f"{len(backbone):,} of {count:,} Gaussians"
-    note += f": {after:.2f} dB at the training cameras, {before:.2f} with all"
+    after = _scores(viewed, viewed.train_cameras)[""]
+    note = f"{len(backbone):,} of {count:,} Gaussians: {after:.2f} dB at the training cameras, {before:.2f} with all"
     scores = _scores(viewed, viewed.test_cameras) if viewed.scores else {}
     if scores:
         note += f"; {scores['']:.2f} dB held out, {viewed.scores['']:.2f} with all"
