@@ -4,7 +4,7 @@ All poses are `T_camera_world` [4, 4] float64 in OpenCV axes. What few cameras d
 stays inside the angle that they span.
 
 nerfstudio's camera_path.json has poses camera-to-world in OpenGL axes (x right, y up, z back), and vertical fields of
-view in degrees. A `dataparser_transforms.json` beside it, which turned and scaled the recording's world, is undone.
+view in degrees.
 """
 
 from __future__ import annotations
@@ -80,16 +80,6 @@ def orbit(
     start = rig.middle - rig.focus
     around = [rotation_of_vector(np.radians(angle) * rig.up) @ start for angle in angles]
     return [at_pose(cameras[0], look_at(rig.focus + offset, rig.focus, rig.up)) for offset in around]
-
-
-def through(cameras: Sequence[Camera], count: int) -> list[Camera]:
-    """From camera to camera, each the nearest that is left: the first pose is the first camera, the last the last.
-
-    Positions, rotations and lenses are interpolated; the path rests at each camera for a moment.
-    """
-    chain = _chained(cameras)
-    places = np.linspace(0, len(chain) - 1, count) if count > 1 else np.zeros(1)
-    return [between(chain, place) for place in places]
 
 
 def look_at(position: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
@@ -173,18 +163,6 @@ def _arc(flat: np.ndarray, up: np.ndarray) -> tuple[float, float]:
     return float(angles[begin % len(angles)]) + span / 2, span
 
 
-def _chained(cameras: Sequence[Camera]) -> list[Camera]:
-    """The cameras in an order of small steps, begun at an end of the rig: the camera farthest from their mean."""
-    centres = np.stack([camera.centre for camera in cameras])
-    at = int(np.linalg.norm(centres - centres.mean(axis=0), axis=1).argmax())
-    order, left = [at], set(range(len(cameras))) - {at}
-    while left:
-        at = min(left, key=lambda i: float(np.linalg.norm(centres[i] - centres[order[-1]])))
-        order.append(at)
-        left.remove(at)
-    return [cameras[i] for i in order]
-
-
 def between(chain: Sequence[Camera], place: float) -> Camera:
     """The pose at `place` of a chain: whole numbers are its cameras."""
     first = min(int(place), len(chain) - 1)
@@ -224,7 +202,7 @@ def read_camera_path(path: Path) -> CameraPath:
     try:
         table = read_json(path, EXPORT)
     except NoSuchFile:
-        raise D2Error(f"no camera path at {path}: give orbit, through, held-out, training or a file") from None
+        raise D2Error(f"no camera path at {path}: give orbit, held-out, training or a file") from None
     kind, place = table.get("camera_type", "perspective"), str(path)
     if kind != "perspective":
         raise D2Error(f"{path} is for a camera of type {str(kind)[:40]!r}, expected perspective: export it as that")
@@ -232,17 +210,15 @@ def read_camera_path(path: Path) -> CameraPath:
     entries = field(table, "camera_path", list, place, EXPORT)
     if not entries:
         raise D2Error(f"the camera path {path} has no camera: add keyframes and {EXPORT}")
-    dataparser = _dataparser(path.parent / "dataparser_transforms.json")
     cameras, times = [], []
     for number, entry in enumerate(entries):
         where = f"camera {number} of {path}"
         if not isinstance(entry, Mapping):
             raise D2Error(f"{where} is no object: {EXPORT}")
-        T_world_camera = _matrix(entry, "camera_to_world", 4, where)
+        T_world_camera = _pose(entry, where)
         focal = size[1] / 2 / np.tan(np.radians(field(entry, "fov", Vertical, where, EXPORT)) / 2)
-        to_nerfstudio, scale = dataparser
         R = T_world_camera[:3, :3].T  # whether it is a rotation is checked of the camera that comes of it
-        pose = OPENGL_TO_OPENCV @ rigid(R, -R @ T_world_camera[:3, 3] / scale) @ to_nerfstudio
+        pose = OPENGL_TO_OPENCV @ rigid(R, -R @ T_world_camera[:3, 3])
         K = pinhole(focal, focal, size[0] / 2, size[1] / 2)
         cameras.append(replace(checked_camera(str(number), size, K, pose, None, place), name=""))
         times.append(field(entry, "render_time", OptionalTime, where, EXPORT, default=None))
@@ -265,23 +241,15 @@ def camera_path_text(cameras: Sequence[Camera], shares: Sequence[float], fps: fl
     return json_text(size | {"fps": fps, "seconds": len(entries) / fps, "camera_path": entries}, "the camera path")
 
 
-def _dataparser(path: Path) -> tuple[np.ndarray, float]:
-    """From the recording's world to nerfstudio's, [4, 4], and the scale that positions there were multiplied by."""
-    if not path.is_file():
-        return np.eye(4), 1.0
-    table = read_json(path, EXPORT)
-    return _matrix(table, "transform", 3, str(path)), field(table, "scale", Above0, str(path), EXPORT)
-
-
-def _matrix(table: Mapping[str, Any], name: str, rows: int, place: str) -> np.ndarray:
-    """The pose under `name`, [4, 4], from the first `rows` rows of 4 numbers, nested or not."""
-    matrix, values = np.eye(4), field(table, name, list, place, EXPORT)
+def _pose(entry: Mapping[str, Any], place: str) -> np.ndarray:
+    """`camera_to_world` of an entry, [4, 4], nested or not."""
+    values = field(entry, "camera_to_world", list, place, EXPORT)
     try:
-        matrix[:rows] = np.array(values, np.float64).reshape(rows, 4)
+        matrix = np.array(values, np.float64).reshape(4, 4)
     except (TypeError, ValueError, OverflowError):
-        raise D2Error(f"{name} of {place} is no matrix of {rows} x 4 numbers: {EXPORT}") from None
+        raise D2Error(f"camera_to_world of {place} is no matrix of 4 x 4 numbers: {EXPORT}") from None
     if not (np.abs(matrix) <= LARGEST_NUMBER).all():
-        raise D2Error(f"{name} of {place} has a number that is not finite or too large: {EXPORT}")
+        raise D2Error(f"camera_to_world of {place} has a number that is not finite or too large: {EXPORT}")
     if not np.array_equal(matrix[3], (0, 0, 0, 1)):
-        raise D2Error(f"{name} of {place} ends in {matrix[3].tolist()}, expected 0, 0, 0, 1: {EXPORT}")
+        raise D2Error(f"camera_to_world of {place} ends in {matrix[3].tolist()}, expected 0, 0, 0, 1: {EXPORT}")
     return matrix

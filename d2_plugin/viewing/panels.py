@@ -9,9 +9,8 @@ from functools import cached_property
 import numpy as np
 from torch import Tensor
 
-from d2_plugin.errors import D2Error
-from d2_plugin.priors.sheet import LABEL_COLORS, SURE, UNSURE, label_colors, sigma_colors
-from d2_plugin.protocol import DepthPrior, Label, View
+from d2_plugin.priors.sheet import sigma_colors
+from d2_plugin.protocol import DepthPrior, View
 from d2_plugin.recordings.images import opencv
 from d2_plugin.runs.drawing import Panel, Scale, as_bytes, colorize, depth_panel, error_panel
 from d2_plugin.viewing.rendering import RenderedView, render_view
@@ -29,27 +28,20 @@ class Shot:
     depths: Scale | None = None
     """Depths at both ends of the colours, the same for all images of a video, or it would flicker; by default those of
     this image."""
-    min_opacity: float = 0.0
     marked: Tensor | None = None
     """See `render_view`."""
 
     @cached_property
     def rendered(self) -> RenderedView:
         """What the backbone shows."""
-        return render_view(self.viewed.backbone, self.view, self.min_opacity, self.marked)
+        recorded = self.viewed.recording.cameras.get(self.view.camera, self.viewed.training[0])
+        return render_view(self.viewed.backbone, self.view, self.marked, float(self.view.K[0, 0] / recorded.K[0, 0]))
 
     @cached_property
     def truth(self) -> np.ndarray:
         """The recorded image, RGB uint8 [H, W, 3] at the view's size."""
         image = self.viewed.recording.image(self.view.camera, self.view.frame)
         return fitted(image, self.view.width, self.view.height)
-
-    @cached_property
-    def prior(self) -> DepthPrior | None:
-        """The depth prior of this view at its own size; None where the store has none."""
-        store = self.viewed.store
-        known = store is not None and self.view.camera in store.cameras
-        return store.prior(self.view.camera, self.view.frame) if known and store is not None else None
 
 
 def true_depth(shot: Shot) -> Panel:
@@ -67,22 +59,6 @@ def error(shot: Shot) -> Panel:
     return error_panel(difference, f"  {-10 * np.log10(noise):.1f} dB" if noise > 0 else "")
 
 
-def sigma(shot: Shot) -> Panel:
-    """How wrong the prior says it may be."""
-    image = _of_prior(shot, prior_sigma_colors)
-    rows = np.geomspace(SURE, UNSURE, 256, dtype=np.float32)[None]
-    bar = sigma_colors(rows, np.ones_like(rows))[0]
-    return Panel(f"sigma {SURE:.1%}..{UNSURE:.0%}", image, bar)
-
-
-def labels(shot: Shot) -> Panel:
-    """What the prior knows about each pixel."""
-    image = _of_prior(shot, lambda prior: label_colors(prior.labels.numpy()))
-    shown = (Label.VERIFIED, Label.AGREED, Label.MONO, Label.FAR, Label.CONFLICT, Label.EMPTY)
-    bar = np.array([LABEL_COLORS[label] for label in shown], np.uint8).repeat(64, axis=0)
-    return Panel("verified agreed mono far conflict empty", image, bar)
-
-
 KINDS: dict[str, Callable[[Shot], Panel]] = {
     "rgb": lambda shot: Panel("render", as_bytes(shot.rendered.color.numpy())),
     "depth": lambda shot: depth_panel("depth", shot.rendered.depth.numpy(), shot.depths),
@@ -90,12 +66,9 @@ KINDS: dict[str, Callable[[Shot], Panel]] = {
     "truth": lambda shot: Panel("recorded", shot.truth),
     "error": error,
     "true-depth": true_depth,
-    "prior": lambda shot: depth_panel("prior", _of_prior(shot, lambda prior: prior.depth.numpy()), shot.depths),
-    "sigma": sigma,
-    "labels": labels,
 }
 """By the name that --show takes."""
-RECORDED = ("truth", "error", "true-depth", "prior", "sigma", "labels")
+RECORDED = ("truth", "error", "true-depth")
 """Those that exist at the recording's own cameras and frames only."""
 
 
@@ -113,16 +86,6 @@ def fitted(array: np.ndarray, width: int, height: int, nearest: bool = False) ->
     large = cv2.resize(array, whole, interpolation=how)
     left, top = (whole[0] - width) // 2, (whole[1] - height) // 2
     return large[top : top + height, left : left + width]
-
-
-def _of_prior(shot: Shot, draw: Callable[[DepthPrior], np.ndarray]) -> np.ndarray:
-    """An image or map of the prior at the view's size."""
-    if shot.prior is None:
-        raise D2Error(
-            f"there is no depth prior of camera {shot.view.camera}, frame {shot.view.frame}: leave prior, sigma and "
-            "labels out of --show, or build the priors with `d2 priors`"
-        )
-    return fitted(draw(shot.prior), shot.view.width, shot.view.height, nearest=True)
 
 
 def prior_sigma_colors(prior: DepthPrior) -> np.ndarray:

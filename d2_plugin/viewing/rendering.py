@@ -6,6 +6,7 @@ can be shown. The trainer's own `render` is not called: it may keep state betwee
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import torch
@@ -35,19 +36,19 @@ class RenderedView(NamedTuple):
 
 
 @torch.no_grad()
-def render_view(backbone: Any, view: View, min_opacity: float = 0.0, marked: Tensor | None = None) -> RenderedView:
-    """Draw one view of a `d2_plugin.protocol.Backbone`, without Gaussians whose opacity at that time is lower than
-    `min_opacity`, and with the rows `marked`, bool [N], highlighted."""
+def render_view(backbone: Any, view: View, marked: Tensor | None = None, scale: float = 1.0) -> RenderedView:
+    """Draw one view of a `d2_plugin.protocol.Backbone`, with the rows `marked`, bool [N], highlighted.
+
+    `scale` is the number of its pixels that lie along one of the recording's: the blur of training is of those, and
+    what is thinner would be a hairline in a finer image."""
     splats = backbone.slice_at(view)
     grey = splats.means.new_full((len(splats.means), 3), GREY)
     colors = backbone.colors(view, splats) if hasattr(backbone, "colors") else grey
-    if min_opacity > 0:
-        kept = torch.nonzero(splats.opacities >= min_opacity).squeeze(-1)
-        splats, colors = Splats(*(part[kept] for part in splats)), colors[kept]
     if marked is not None:
         chosen = marked.to(splats.rows.device)[splats.rows][:, None]
         colors = torch.where(chosen, colors.new_tensor(MARKED), FADED * colors.mean(-1, keepdim=True))
-    render = rasterize(splats, colors.contiguous(), view, backbone.settings)
+    settings = replace(backbone.settings, blur=backbone.settings.blur * max(scale, 1.0) ** 2)
+    render = rasterize(splats, colors.contiguous(), view, settings)
     if marked is None:
         render = call_optional(backbone, "behind", render, view, default=render)
     color, depth_sum, alpha = (part.cpu() for part in render[:3])

@@ -47,6 +47,8 @@ class ViewedRun:
     """PSNR of each scored camera, and under "" that of all held-out ones, as far as it is known."""
     note: str = ""
     """What a person should know about it, in one sentence."""
+    background_weight: float = 1.0
+    """Photometric weight of pixels outside the recording's foreground masks, as the run trained."""
     time_scale: float = 1.0
     """The trainer's unit of time, per second."""
     time_offset: float = 0.0
@@ -126,6 +128,7 @@ def _of_run(run: Run, backbone: Any, inserted_at: Tensor | None) -> ViewedRun:
         inserted_at,
         TimedPoints.load(path).positions if path.is_file() else None,
         run.settings.device,
+        background_weight=run.settings.background_weight,
     )
 
 

@@ -41,14 +41,14 @@ def _layers(names: Mapping[str, tuple[int, int]]) -> dict[str, tuple[int, ...]]:
 
 
 def motion_network(variant: str = "plain") -> dict[str, Tensor]:
-    """`DeformNetwork.state_dict()` of Deformable-3D-Gaussians (ac42372), utils/time_utils.py; "plain", "is_blender" or
-    "is_6dof"."""
+    """`DeformNetwork.state_dict()` of Deformable-3D-Gaussians (ac42372), utils/time_utils.py; "plain" or
+    "is_blender"."""
     blender = variant == "is_blender"
     seen = 93 if blender else 84
     names = {"timenet.0": (256, 13), "timenet.2": (30, 256)} if blender else {}
     names |= {f"linear.{i}": (256, {0: seen, 5: 256 + seen}.get(i, 256)) for i in range(8)}
-    names |= {"branch_w": (3, 256), "branch_v": (3, 256)} if variant == "is_6dof" else {"gaussian_warp": (3, 256)}
-    return filled(_layers(names | {"gaussian_rotation": (4, 256), "gaussian_scaling": (3, 256)}))
+    heads = {"gaussian_warp": (3, 256), "gaussian_rotation": (4, 256), "gaussian_scaling": (3, 256)}
+    return filled(_layers(names | heads))
 
 
 def plane_field(depth: int = 1) -> dict[str, Tensor]:
@@ -148,28 +148,6 @@ DEFORMED = {
             [-1.506703, -0.463198, -0.66357, 4.174744],
         ],
         [[-0.621892, 2.199433, 0.224791], [0.061136, 2.25501, 0.096603], [-0.039021, 2.178505, 0.127017]],
-    ),
-    "is_6dof": (
-        [
-            [
-                *(-0.928815, -0.165149, -0.331813, -1.961398, 0.06167, -0.951658, 0.301026, -0.579502),
-                *(-0.365474, 0.259124, 0.894029, -0.903301, 0, 0, 0, 1),
-            ],
-            [
-                *(-0.903003, -0.428858, 0.027213, -1.994241, 0.428954, -0.903364, -0.002528, -0.378429),
-                *(0.025667, 0.00939, 0.999626, -2.294352, 0, 0, 0, 1),
-            ],
-            [
-                *(-0.846721, -0.529485, -0.05284, -2.123375, 0.213999, -0.429772, 0.877248, -0.239513),
-                *(-0.487186, 0.731441, 0.477145, -0.144011, 0, 0, 0, 1),
-            ],
-        ],
-        [
-            [-2.052929, 0.281324, -0.009913, 0.086897],
-            [-1.793282, -0.602386, 0.396552, 0.508742],
-            [-2.72425, -0.528372, 0.513826, 0.264481],
-        ],
-        [[-1.112838, -0.016055, 0.626822], [-0.910534, 0.264543, 0.121305], [-2.077128, 0.49931, 0.010358]],
     ),
 }
 """Centres (or motions, 4x4), quaternions and scales that the network of Deformable-3D-Gaussians returns."""

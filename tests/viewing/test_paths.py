@@ -24,7 +24,6 @@ from d2_plugin.viewing.camera_paths import (
     look_at,
     orbit,
     read_camera_path,
-    through,
 )
 
 ARC = list(synthetic_recording(cameras=4, held_out=0, frames=1, width=96, height=54).cameras.values())
@@ -46,23 +45,13 @@ def is_rotation(R: np.ndarray) -> bool:
     return np.allclose(R @ R.T, np.eye(3), atol=1e-9) and np.linalg.det(R) > 0
 
 
-@pytest.mark.parametrize("path", [orbit, through])
 @pytest.mark.parametrize("cameras", [ARC, ARC[:2], ARC[:1], ring(8)], ids=["arc", "two", "one", "ring"])
-def test_every_pose_is_a_camera_pose(path, cameras: list[Camera]) -> None:
-    poses = path(cameras, 17)
+def test_every_pose_of_an_orbit_is_a_camera_pose(cameras: list[Camera]) -> None:
+    poses = orbit(cameras, 17)
     assert len(poses) == 17
     for pose in poses:
         assert np.isfinite(pose.T_camera_world).all()
         assert is_rotation(pose.T_camera_world[:3, :3])
-
-
-def test_a_path_through_the_cameras_begins_and_ends_at_one_and_visits_all() -> None:
-    poses = through(ARC, 31)
-    ends = {tuple(np.round(pose.centre, 9)) for pose in (poses[0], poses[-1])}
-    assert ends <= {tuple(np.round(camera.centre, 9)) for camera in ARC}
-    assert len(ends) == 2
-    for camera in ARC:
-        assert min(np.abs(pose.T_camera_world - camera.T_camera_world).max() for pose in poses) < 1e-9
 
 
 def test_an_orbit_looks_at_the_focus_from_one_distance_and_stays_inside_the_cameras() -> None:
@@ -134,16 +123,6 @@ class TestCameraPathFiles:
         path = folder / "camera_path.json"
         path.write_text(json.dumps(table))
         return path
-
-    def test_what_nerfstudio_did_to_the_world_is_undone(self, tmp_path: Path) -> None:
-        turn = np.array([[0.0, -1, 0, 0.5], [1, 0, 0, -2], [0, 0, 1, 0.25]])
-        (tmp_path / "dataparser_transforms.json").write_text(json.dumps({"transform": turn.tolist(), "scale": 0.1}))
-        whole = np.vstack([turn, [0, 0, 0, 1]])
-        moved = whole @ np.linalg.inv(ARC[1].T_camera_world)
-        moved[:3, 3] *= 0.1
-        there = replace(ARC[1], T_camera_world=np.linalg.inv(moved))
-        found = read_camera_path(self.write(tmp_path, there))
-        assert np.allclose(found.cameras[0].T_camera_world, ARC[1].T_camera_world)
 
     def test_a_path_that_is_written_is_read(self, tmp_path: Path) -> None:
         path = tmp_path / "camera_path.json"

@@ -18,7 +18,6 @@ from d2_plugin import registry
 from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.moving import Harmonics, MovingGaussians, moving_gaussians
 from d2_plugin.gaussians.spherical_harmonics import channel_count
-from d2_plugin.protocol import RasterSettings
 from d2_plugin.recordings import Recording
 from d2_plugin.viewing.checkpoints.files import columns, read_options, read_ply, read_state
 from d2_plugin.viewing.checkpoints.networks import MotionNetwork, PlaneField
@@ -80,23 +79,6 @@ def of_tuple(stored: Sequence[Any], path: Path, recording: Recording) -> Checkpo
             f"(4DGaussians) or {len(STATIC)} (3DGS): show another trainer's model from inside it, with Viewer(d2)"
         )
     return _with_lines(dict(zip(names, stored, strict=True)), recording, timed=names in (FUDAN, FOUR_C))
-
-
-def of_gsplat(parameters: Mapping[str, Tensor]) -> Checkpoint:
-    """The Gaussians of gsplat's simple_trainer, by its names."""
-    rows, note = {name: value.detach() for name, value in parameters.items()}, "gsplat's Gaussians stand still"
-    backbone = _adapter("gsplat", dict(rows), {}, settings=RasterSettings(near=0.01))
-    if "sh0" not in rows:
-        return Checkpoint(backbone, 1.0, note)
-    coefficients = torch.cat([rows["sh0"], rows["shN"]], 1) if "shN" in rows else rows["sh0"]
-    harmonics = Harmonics(coefficients, round(coefficients.shape[1] ** 0.5) - 1)
-    raw = {"positions": rows["means"], "log_scales": rows["scales"], "left": rows["quats"]}
-    return _as_lines(backbone, note, raw | {"opacity_logits": rows["opacities"]}, harmonics)
-
-
-def _as_lines(backbone: Any, note: str, raw: dict[str, Tensor], harmonics: Harmonics) -> Checkpoint:
-    moving = moving_gaussians(raw, harmonics)
-    return Checkpoint(backbone, 1.0, note, moving.harmonics, moving)
 
 
 def newest_cloud(folder: Path) -> Path:
@@ -193,7 +175,8 @@ def _with_lines(values: dict[str, Any], recording: Recording, timed: bool) -> Ch
     if timed:
         raw |= {"times": values["_t"].squeeze(-1), "log_time_scales": values["_scaling_t"].squeeze(-1)}
         raw |= {"right": values["_rotation_r"]}
-    return _as_lines(backbone, note, raw, harmonics)
+    moving = moving_gaussians(raw, harmonics)
+    return Checkpoint(backbone, 1.0, note, moving.harmonics, moving)
 
 
 def _with_planes(values: dict[str, Any], field: PlaneField | None, recording: Recording) -> Checkpoint:

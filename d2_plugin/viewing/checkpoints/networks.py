@@ -2,8 +2,8 @@
 
 Deformable-3D-Gaussians: with e(x) = (x, sin 2^k x, cos 2^k x) for k = 0, 1, ..., position and time go encoded through
 layers with ReLU; the layer after the middle one sees them a second time. Three linear heads then give the offset of the
-centre, of the quaternion and of the scales. In a variant for synthetic scenes two layers encode time first; in another
-the head of the centre is a screw motion.
+centre, of the quaternion and of the scales. In a variant for synthetic scenes two layers encode time first; the one of
+rigid motions, `is_6dof`, is not read.
 
 4DGaussians: a point (x, y, z, t) looks into six planes, one for each pair of its coordinates, on several levels; on a
 level the six features are multiplied, the levels stand beside each other. One hidden layer or more follows, and a head
@@ -49,9 +49,7 @@ class MotionNetwork:
             D2Error: they are not those of this network.
         """
         self.state, self.deform = dict(state), self
-        self.is_6dof = "branch_w.weight" in state
-        motion = ["branch_w", "branch_v"] if self.is_6dof else ["gaussian_warp"]
-        self.heads = [*motion, "gaussian_rotation", "gaussian_scaling"]
+        self.heads = ["gaussian_warp", "gaussian_rotation", "gaussian_scaling"]
         layers = sum(name.startswith("linear.") and name.endswith(".weight") for name in state)
         self.layers = [f"linear.{i}" for i in range(max(layers, 1))]
         needed = [*self.layers, *self.heads]
@@ -71,7 +69,7 @@ class MotionNetwork:
 
     @torch.no_grad()
     def step(self, positions: Tensor, times: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Offsets of centres [N, 3] (or motions [N, 4, 4]), quaternions [N, 4] and scales [N, 3]."""
+        """Offsets of centres [N, 3], quaternions [N, 4] and scales [N, 3]."""
         time = encoded(times, self.times)
         if "timenet.0.weight" in self.state:
             time = _linear(self.state, "timenet.2", _linear(self.state, "timenet.0", time).relu())
@@ -80,28 +78,14 @@ class MotionNetwork:
         for name in self.layers:
             again = self.state[f"{name}.weight"].shape[1] > hidden.shape[1]
             hidden = _linear(self.state, name, torch.cat([seen, hidden], -1) if again else hidden).relu()
-        heads = {name: _linear(self.state, name, hidden) for name in self.heads}
-        *motion, turned, scaled = heads.values()
-        return screw_motions(*motion) if self.is_6dof else motion[0], turned, scaled
+        moved, turned, scaled = (_linear(self.state, name, hidden) for name in self.heads)
+        return moved, turned, scaled
 
 
 def encoded(values: Tensor, frequencies: int) -> Tensor:
     """values [N, C] -> [N, C (1 + 2 frequencies)]: themselves, then sine and cosine of each octave."""
     octaves = [wave(values * 2.0**k) for k in range(frequencies) for wave in (torch.sin, torch.cos)]
     return torch.cat([values, *octaves], -1)
-
-
-def screw_motions(turn: Tensor, shift: Tensor) -> Tensor:
-    """Rigid motions [N, 4, 4] of screws: the exponential of (turn, shift), each [N, 3], with angle |turn|."""
-    angle = turn.norm(dim=-1, keepdim=True)
-    axis, along, angle = turn / angle + 1e-5, shift / angle + 1e-5, angle[..., None]  # as the repository has it
-    one, rest = torch.eye(3).to(axis), 1 - angle.cos()
-    K = torch.linalg.cross(axis[:, None], one[None]).mT  # its columns are the products with the unit vectors
-    rotation = one + angle.sin() * K + rest * (K @ K)
-    reach = angle * one + rest * K + (angle - angle.sin()) * (K @ K)
-    motion = torch.eye(4).to(axis).repeat(len(axis), 1, 1)
-    motion[:, :3] = torch.cat([rotation, reach @ along[..., None]], -1)
-    return motion
 
 
 class PlaneField:

@@ -12,7 +12,7 @@ from d2_plugin.reading import parsing, shown_path
 from d2_plugin.recordings import Recording, open_recording
 from d2_plugin.values import checked_arguments
 from d2_plugin.viewing.checkpoints.files import read_tensors
-from d2_plugin.viewing.checkpoints.models import Checkpoint, newest_cloud, of_cloud, of_gsplat, of_tuple
+from d2_plugin.viewing.checkpoints.models import Checkpoint, newest_cloud, of_cloud, of_tuple
 from d2_plugin.viewing.rendering import render_view
 from d2_plugin.viewing.viewed import ViewedRun, viewed_run
 
@@ -64,11 +64,9 @@ def _checkpoint(path: Path, recording: Recording) -> Checkpoint:
     if path.suffix == ".ply":
         return of_cloud(path, recording)
     stored = read_tensors(path)
-    if isinstance(stored, dict) and "splats" in stored:
-        return of_gsplat(stored["splats"])
     if isinstance(stored, (tuple, list)) and len(stored) == 2 and isinstance(stored[0], (tuple, list)):
         return of_tuple(stored[0], path, recording)
     raise D2Error(
-        f"{path} is no checkpoint that can be shown: have those of fudan, 4C4D, 4DGaussians, 3D Gaussian Splatting and "
-        "gsplat, and point clouds (.ply); inside another trainer, Viewer(d2) shows the model as it trains"
+        f"{path} is no checkpoint that can be shown: have those of fudan, 4C4D, 4DGaussians and 3D Gaussian "
+        "Splatting, and point clouds (.ply); inside another trainer, Viewer(d2) shows the model as it trains"
     )

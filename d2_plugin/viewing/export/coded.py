@@ -1,4 +1,6 @@
-"""The arrays of a page: a moving scene as numbers of 16 bits (or 8 and fewer) between the extremes of their block.
+"""The arrays of a page: a moving scene as numbers of 16 bits, or of 8, between the extremes of their block.
+
+Where and when a Gaussian is, and its opacity, have 16 bits; shapes and colours have 8 (`LOOK_BITS`).
 
 Rows are coded in blocks of 256 neighbours in space (`morton_order`), each column with its own range in each block, so
 that the step is small. An array is stored as ranges float32 [blocks, columns, 2], then per column the high bytes of all
@@ -30,8 +32,8 @@ BLOCK = 256
 """Rows that share their ranges."""
 MARGINAL_REACH = math.sqrt(-2 * math.log(MARGINAL_CUT))
 """Standard deviations from mu_t at which a Gaussian is cut off: F = `MARGINAL_CUT`."""
-HARMONIC_BITS = 8
-"""Of all coefficients of a colour but the constant one."""
+LOOK_BITS = 8
+"""Of shapes and colours: images then differ by about what the bytes of a screen round (docs/evidence.md)."""
 
 
 class Coded(NamedTuple):
@@ -103,7 +105,7 @@ def code_keys(keys: Keys, harmonics: Harmonics) -> CodedScene:
     for i, state in enumerate(keys.states):
         arrays.append(encode(f"positions_{i}", state.positions.numpy()))
         if keys.changing:
-            arrays.append(encode(f"shapes_{i}", _shapes(state.factors)))
+            arrays.append(encode(f"shapes_{i}", _shapes(state.factors), LOOK_BITS))
             arrays.append(encode(f"opacities_{i}", state.opacities.numpy()))
     return CodedScene(arrays, len(keys.rows), "keys", keys)
 
@@ -130,7 +132,7 @@ def seen_rows(gaussians: MovingGaussians, duration: float) -> Tensor:
 def _code_state(state: State) -> list[Coded]:
     return [
         encode("positions", state.positions.numpy()),
-        encode("shapes", _shapes(state.factors)),
+        encode("shapes", _shapes(state.factors), LOOK_BITS),
         encode("opacities", state.opacities.numpy()),
     ]
 
@@ -138,7 +140,7 @@ def _code_state(state: State) -> list[Coded]:
 def _code_colors(harmonics: Harmonics) -> list[Coded]:
     """The constant colours, and the harmonics above them."""
     coefficients = harmonics.coefficients
-    arrays = [encode("colors", coefficients[:, 0].numpy())]
+    arrays = [encode("colors", coefficients[:, 0].numpy(), LOOK_BITS)]
     if coefficients.shape[1] > 1:
-        arrays.append(encode("harmonics", coefficients[:, 1:].flatten(1).numpy(), HARMONIC_BITS))
+        arrays.append(encode("harmonics", coefficients[:, 1:].flatten(1).numpy(), LOOK_BITS))
     return arrays

@@ -13,8 +13,9 @@ from d2_plugin.durable import make_folder, remove_leftovers
 from d2_plugin.errors import D2Error
 from d2_plugin.locks import only_writer
 from d2_plugin.progress import progress_bar
-from d2_plugin.settings import Count, Downscale, Positional, Settings
+from d2_plugin.settings import Count, Downscale, Positional, Range, Settings
 from d2_plugin.viewing.checkpoints import open_viewed
+from d2_plugin.viewing.export.compact import compacted
 from d2_plugin.viewing.export.fourdgs import write_4dgs
 from d2_plugin.viewing.export.page import write_page
 from d2_plugin.viewing.export.ply import write_ply
@@ -38,6 +39,9 @@ class Export(Settings):
     """Folder to write into; `export` inside the last run's folder if not given."""
     frames: tuple[Count, ...] | None = None
     """first:last or first:last:step, the last one included, of a file for each frame; all frames if not given."""
+    keep: Annotated[float, Range(0, 1, open_low=True)] = 1.0
+    """Share of the Gaussians that is kept: those that training images would miss least go, the others train on for a
+    few hundred steps. What that costs is measured and said."""
     recording: Path | None = None
     """The recording of a checkpoint of an official trainer."""
     train_cameras: tuple[str, ...] | None = None
@@ -60,11 +64,13 @@ def run(settings: Export) -> str:
         raise D2Error(f"{len(settings.runs)} runs are given: give one, or for a page of html one or two")
     checkpoint = settings.recording, settings.train_cameras, settings.downscale
     shown, path = [open_viewed(path, *checkpoint) for path in settings.runs], settings.runs[-1]
+    if settings.keep < 1:
+        shown = [compacted(viewed, settings.keep) for viewed in shown]
     output = settings.output or (path.parent if path.is_file() else path) / "export"
     paths, notes = write_export([export_scene(viewed) for viewed in shown], settings, output)
     what = f"{len(paths)} files in {paths[0].parent}" if len(paths) > 1 else str(paths[0])
     size = sum(path.stat().st_size for path in paths) / 1e6
-    return "\n".join([f"{what} ({size:.1f} MB)", *(viewed.note for viewed in shown if viewed.note), *notes])
+    return "\n".join([f"{what} ({size:.1f} MB)", *notes])
 
 
 def write_export(scenes: list[ExportScene], settings: Export, folder: Path) -> Written:
@@ -78,6 +84,7 @@ def write_export(scenes: list[ExportScene], settings: Export, folder: Path) -> W
             paths, notes = [folder / "scene.4dgs"], write_4dgs(scene, folder / "scene.4dgs")
         else:
             paths, notes = _frame_files(scene, settings, folder / settings.format), []
+    notes = [*scene.viewed.note.splitlines(), *notes]
     if scene.background is not None:
         notes = [*notes, "the background behind the Gaussians is left out: the format has no place for it, html has"]
     return paths, notes

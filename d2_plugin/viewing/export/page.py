@@ -34,7 +34,6 @@ PAGE_SCRIPTS = ("controls.js", "scene.js", "shaders.js", "renderer.js", "pace.js
 WORKER_SCRIPTS = ("scene.js", "sorter.js")
 RECORDED_BYTES, RECORDED_HEIGHT, RECORDED_QUALITY = 2.5e6, 360, 80
 """Of the recorded images in a page: all together, at most so many pixels high, quality of WebP."""
-CONTROLS_HEIGHT = 50  # pixels below the image
 
 
 def _placed(data: bytearray, part: bytes) -> int:
@@ -67,11 +66,8 @@ def write_page(scenes: Sequence[ExportScene], path: Path) -> list[str]:
     if images:
         count, size = sum(map(len, images.values())), sum(length for kept in images.values() for _, _, length in kept)
         about.append(f"{count} recorded images of the cameras {', '.join(images)}: {size / 1e6:.1f} MB of the page")
-    camera = last.cameras[0]
-    wide = 640, round(640 * camera.height / camera.width) + CONTROLS_HEIGHT
     about += [
         f"{len(last.viewed.recording.frames)} frames at {last.viewed.recording.fps:g} per second",
-        f'to embed: <iframe src="{path.name}" width="{wide[0]}" height="{wide[1]}" allow="fullscreen"></iframe>',
         f"made by d2-4dgs {d2_plugin.__version__}; no network is used",
     ]
     header = _header(last) | {"models": models, "recorded": images, "about": about}
@@ -103,7 +99,7 @@ def _recorded(scene: ExportScene, data: bytearray) -> dict[str, list[tuple[int, 
 
 
 def _about(scene: ExportScene, coded: CodedScene) -> list[str]:
-    keys, lines = coded.keys, [f"{coded.gaussians:,} Gaussians"]
+    keys, lines = coded.keys, [*scene.viewed.note.splitlines(), f"{coded.gaussians:,} Gaussians"]
     if keys is not None:
         lines.append(
             f"a deformation field at {len(keys.times)} key times, straight in between: off by {keys.offset}; "

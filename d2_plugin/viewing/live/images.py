@@ -84,7 +84,7 @@ def draw(page: Page, wanted: Wanted, marked: Tensor | None, seconds: float | Non
         camera, frame = viewed.recording.cameras[wanted.standing], viewed.frame_at(wanted.time)
         shape = max(round(size[1] * camera.width / camera.height), 1), size[1]
         view = viewed.view(camera, viewed.recording.seconds(frame), shape)
-    shot = Shot(viewed, view, None, wanted.min_opacity, marked if known else None)
+    shot = Shot(viewed, view, None, marked if known else None)
     image = KINDS[wanted.show](shot).image
     if wanted.recorded > 0:
         image = np.rint((1 - wanted.recorded) * image + wanted.recorded * shot.truth).astype(np.uint8)

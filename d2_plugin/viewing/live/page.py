@@ -48,7 +48,6 @@ class Wanted(NamedTuple):
     aspect: float
     time: float
     show: str
-    min_opacity: float
     marked: bool
     height: int
     standing: str | None = None
@@ -117,7 +116,6 @@ class Page:
             known, height = viewed.inserted_at is not None, self.most_height
             with gui.add_folder("Image"):
                 controls["show"] = gui.add_dropdown("show", [*IMAGES, NO_IMAGE], initial_value="image")
-                controls["opacity"] = gui.add_slider("opacity from", 0.0, 0.95, 0.05, 0.0)
                 controls["marked"] = gui.add_checkbox("inserted by D2 in orange", False, disabled=not known)
                 controls["recorded"] = gui.add_slider("recorded over it", 0.0, 1.0, 0.05, 0.0)
                 controls["height"] = gui.add_slider("height", min(90, height), max(height * 2, 720), 1, height)
@@ -265,13 +263,12 @@ class Page:
         if seen is None:
             return None
         show = IMAGES.get(self.word("show", NO_IMAGE), "")
-        instant, least = self.number("time", 0.0), self.number("opacity", 0.0)
-        height = self.number("height", self.most_height)
+        instant, height = self.number("time", 0.0), self.number("height", self.most_height)
         at = self._standing(seen[0])
         recorded = self.number("recorded", 0.0) if at else 0.0
         if show == "error" and at is None:
             show = "rgb"
-        wanted = Wanted(*seen, instant, show, least, self.ticked("marked"), int(height), at, recorded)
+        wanted = Wanted(*seen, instant, show, self.ticked("marked"), int(height), at, recorded)
         if wanted != self.last:
             self.last = wanted
             if self._played_at is None:

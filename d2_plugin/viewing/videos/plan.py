@@ -12,14 +12,13 @@ import numpy as np
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.recordings import Camera
 from d2_plugin.settings import Downscale, Positional, Range, Settings
-from d2_plugin.viewing.camera_paths import orbit, read_camera_path, through
+from d2_plugin.viewing.camera_paths import orbit, read_camera_path
 from d2_plugin.viewing.panels import RECORDED
 from d2_plugin.viewing.videos.video import RATES, Format
 from d2_plugin.viewing.viewed import ViewedRun
 
 STANDING = ("held-out", "training")
-MOVING = ("orbit", "through")
-"""Paths by name; anything else is the path of a file."""
+"""Paths by name, as is orbit; anything else is the path of a file."""
 MOVING_SECONDS = 6.0
 """Length of a video whose camera moves, where the recording is shorter."""
 MOST_IMAGES = 1_000_000
@@ -36,10 +35,10 @@ class RenderSettings(Settings):
     """File of the video, or folder of its PNGs; by default in videos/ of the first run."""
     path: str = "held-out"
     """Where the camera stands: held-out (each held-out camera in turn), training (each training camera), or where it
-    moves: orbit, through (the training cameras), or a nerfstudio camera_path.json."""
+    moves: orbit, or a camera_path.json of `d2 view`."""
     show: tuple[str, ...] = ("rgb",)
-    """Images beside each other, joined by commas: rgb, depth, alpha; at the recording's
-    cameras also truth, error, true-depth, and from the depth prior: prior, sigma, labels."""
+    """Images beside each other, joined by commas: rgb, depth, alpha; at the recording's cameras also truth, error,
+    true-depth."""
     cameras: tuple[str, ...] | None = None
     """Cameras of the path; by default all held-out or all training cameras."""
     at: Annotated[float, Range(0, 1e6, unit="seconds")] | None = None
@@ -105,8 +104,8 @@ def plan_video(viewed: ViewedRun, settings: RenderSettings) -> Plan:
     fps = settings.fps or viewed.recording.fps
     if settings.path in STANDING:
         stops = _standing(viewed, settings, fps)
-    elif settings.path in MOVING:
-        stops = _moving(viewed, settings, fps)
+    elif settings.path == "orbit":
+        stops = _orbiting(viewed, settings, fps)
     else:
         stops, fps = _from_file(viewed, settings)
     if settings.recorded:
@@ -132,7 +131,7 @@ def _standing(viewed: ViewedRun, settings: RenderSettings, fps: float) -> list[S
     of_path = viewed.test_cameras if settings.path == "held-out" else viewed.train_cameras
     names = _known(viewed, settings.cameras or of_path)
     if not names:
-        raise D2Error(f"{viewed.name} has no held-out camera: choose --path training, through or orbit")
+        raise D2Error(f"{viewed.name} has no held-out camera: choose --path training or orbit")
     if settings.seconds is not None:
         count = _count(settings.seconds * fps, 1)
     elif settings.at is None and viewed.duration > 0:
@@ -143,21 +142,18 @@ def _standing(viewed: ViewedRun, settings: RenderSettings, fps: float) -> list[S
     return [Stop(viewed.recording.cameras[name], time) for name in names for time in times]
 
 
-def _moving(viewed: ViewedRun, settings: RenderSettings, fps: float) -> list[Stop]:
+def _orbiting(viewed: ViewedRun, settings: RenderSettings, fps: float) -> list[Stop]:
     names = _known(viewed, settings.cameras or viewed.train_cameras)
     cameras = [viewed.recording.cameras[name] for name in names]
     played = 0 if settings.at is not None else viewed.duration / settings.speed
     count = _count((settings.seconds or max(MOVING_SECONDS, played)) * fps, 2)
-    if settings.path == "orbit":
-        path = orbit(cameras, count, settings.degrees, viewed.depth)
-    else:
-        path = through(cameras, count)
+    path = orbit(cameras, count, settings.degrees, viewed.depth)
     return [Stop(camera, time) for camera, time in zip(path, _instants(viewed, settings, count, fps), strict=True)]
 
 
 def _from_file(viewed: ViewedRun, settings: RenderSettings) -> tuple[list[Stop], float]:
     if not settings.path.endswith(".json"):
-        raise unknown_name("camera path", settings.path, [*STANDING, *MOVING, "FILE.json"])
+        raise unknown_name("camera path", settings.path, [*STANDING, "orbit", "FILE.json"])
     path = read_camera_path(Path(settings.path))
     fps = settings.fps or (len(path.cameras) / settings.seconds if settings.seconds else path.fps)
     if path.shares is not None and settings.at is None:

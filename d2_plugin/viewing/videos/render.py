@@ -125,7 +125,7 @@ def _joined(images: Sequence[np.ndarray], axis: int) -> np.ndarray:
 
 def _depths(runs: Sequence[ViewedRun], plan: Plan, size: tuple[int, int], show: Sequence[str]) -> Scale:
     """The range of depths of a video, from a few of its images; not computed where none is shown."""
-    if not {"depth", "true-depth", "prior"} & set(show):
+    if not {"depth", "true-depth"} & set(show):
         return 0.0, 1.0
     chosen = np.unique(np.linspace(0, len(plan.stops) - 1, SAMPLED).round().astype(int))
     small = max(size[0] // 2, 1), max(size[1] // 2, 1)

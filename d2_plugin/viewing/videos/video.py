@@ -29,7 +29,6 @@ Format = Literal["mp4", "webp", "png"]
 RATES = (0.001, 1000.0)
 """Images per second that files of videos can say."""
 
-
 CODECS = {"mp4": ("libx264", {"movflags": "+faststart"}), "webp": ("libwebp_anim", {"loop": "0"})}
 """FFmpeg's name of a format's codec, and the options of its container."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from d2_plugin.commands.cli import main
 from d2_plugin.recordings.export.folder import save_recording
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.runs.run import Run
+from d2_plugin.viewing.export import compact
 
 
 @pytest.fixture(scope="module")
@@ -57,6 +59,23 @@ def test_frames_are_chosen_by_number(trained: Path, capsys: pytest.CaptureFixtur
     assert "no frame 7: it has 0 to 2" in refused(capsys, "export", run, "--format", "ply", "--frames", "7")
     assert "--frames is for ply, sog, spz, glb" in refused(capsys, "export", run, "--frames", "1")
     assert "--frames" in refused(capsys, "export", run, "--format", "ply", "--frames", "")
+
+
+def test_a_share_of_the_gaussians_is_kept_and_what_that_costs_is_said(
+    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(compact, "STEPS", 20)
+    run, sizes = str(trained / "yang4d"), []
+    for keep in ("1", "0.25"):
+        assert main(["export", run, "--keep", keep, "--output", str(tmp_path)]) == 0
+        sizes.append(ReadPage(tmp_path / "scene.html").model)
+    said = capsys.readouterr().out
+    assert sizes[1]["count"] <= sizes[0]["count"] / 3
+    form = r"Gaussians: (.*) dB at the training cameras, (.*) with all; (.*) dB held out, (.*) with all"
+    after, before, kept, whole = re.search(form, said).groups()
+    assert float(after) > float(before), "20 steps more of a run of four"
+    assert [f"{model['scores']['']:.2f}" for model in sizes] == [whole, kept]
+    assert "keep must be above 0" in refused(capsys, "export", run, "--keep", "0")
 
 
 def test_a_run_that_still_trains_is_exported_as_far_as_it_is(

@@ -76,6 +76,23 @@ def test_the_page_shows_what_the_rasterizer_draws(new_page: Any, tmp_path: Path,
     assert page.requests == []
 
 
+def test_in_an_image_of_more_pixels_the_blur_is_of_the_recordings(new_page: Any, tmp_path: Path) -> None:
+    model = sharp_model("yang4d")
+    with torch.no_grad():
+        model.gaussians["log_scales"][:, 1:] -= 3  # thinner than a pixel
+    page = opened(new_page, model, tmp_path / "scene.html")
+    script = """async (name) => {
+        const p = await d2, free = new FreeCamera(p.header), camera = p.header.cameras.find((c) => c.name === name);
+        free.place(camera);
+        return p.still(free.view(2 * camera.width, 2 * camera.height), 0, "color", [{ what: 0, until: 1 }]);
+    }"""
+    seen = image(page.run(script, CAMERAS[2])) / 255
+    assert psnr(seen, rasterized(model, 2, 0.0, finer=2)["color"]) < 40, "as sharp as its own pixels"
+    raster = replace(model.settings.raster, blur=4 * model.settings.raster.blur)
+    model.settings = replace(model.settings, raster=raster)
+    assert psnr(seen, rasterized(model, 2, 0.0, finer=2)["color"]) > 45
+
+
 def test_without_its_background_the_page_would_not_pass(new_page: Any, tmp_path: Path) -> None:
     model = sharp_model("yang4d")
     page = opened(new_page, model, tmp_path / "scene.html")

@@ -107,7 +107,9 @@ class Renderer {
     const { order, motion, colors } = model;
     const set = this.use(this.splats, { order, stateFrom: model.state(key), stateTo: model.state(key + 1), motion, colors });
     set.float({ share, time, cut: header.marginal_cut, duration: Math.max(header.duration, 1e-12) });
-    set.float({ near: raster.near, blur: raster.blur, alphaMin: raster.alpha_min, alphaMax: raster.alpha_max });
+    // The blur of training is of the recording's pixels: what is thinner would be a hairline in an image of finer ones.
+    const blur = raster.blur * Math.max(view.scale, 1) ** 2;
+    set.float({ near: raster.near, blur, alphaMin: raster.alpha_min, alphaMax: raster.alpha_max });
     set.float({ fovClamp: raster.fov_clamp, depthUnit: header.depth_range[1] });
     set.whole({ lines: scene.lines ? 1 : 0, asDepth: mode === "depth" ? 1 : 0 });
     set.whole({ degree: scene.model.degree, timeDegree: scene.model.time_degree });
