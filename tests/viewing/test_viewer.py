@@ -278,7 +278,7 @@ def test_the_prior_as_points_lies_where_its_pixels_say(viewed: ViewedRun) -> Non
 def test_controls_are_those_that_the_subject_has(viewed: ViewedRun) -> None:
     page = Page(looker(), viewed, None, 360, lambda: None)
     page.build()
-    assert {"time", "show", "opacity", "marked", "cloud"} <= set(page.controls)
+    assert {"time", "show", "recorded", "marked", "cloud"} <= set(page.controls)
     assert "pause" not in page.controls
     bare = Page(looker(), viewed_recording(viewed.recording, viewed.store.path), None, 360, lambda: None)
     bare.build()
@@ -317,7 +317,6 @@ def damaged(client: Any, page: Page) -> list[Callable[[], object]]:
         *(camera(aspect=aspect) for aspect in (1e9, 0.0, nan, -1.0, "abc")),
         *(control("height", height) for height in (0, -5, 10**6, nan, "abc", None, True)),
         *(control("time", time) for time in (nan, math.inf, 1e300, "abc", [])),
-        *(control("opacity", opacity) for opacity in (nan, -1, 7, {})),
         *(control(name, word) for name in ("show", "speed", "cloud", "camera") for word in ("abc", None, 5, [], {})),
         *(control(name, value) for name in ("play", "marked", "frusta") for value in ("abc", nan, None)),
         *(control(name, value) for name in ("recorded", "path_seconds") for value in (nan, "abc", -1, 1e300)),

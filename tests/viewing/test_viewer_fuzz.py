@@ -81,14 +81,14 @@ def test_only_what_the_page_sends_comes_in(viewed: ViewedRun, monkeypatch: pytes
     with showing(viewed, 48) as viewer, connected(viewer) as socket:
         drawn(viewer, 1)
         [(page, _)] = viewer._pages.values()
-        control = page.controls["opacity"]
+        control = page.controls["recorded"]
         update = {"type": "GuiUpdateMessage", "uuid": control._impl.uuid}
         socket.send(msgpack.encode({"type": "ShareUrlRequest"}))
         socket.send(msgpack.encode({**update, "updates": {"max": 5.0, "value": 0.2}}))
         socket.send(msgpack.encode({**update, "updates": {"update_cb": [1]}}))
         socket.send(msgpack.encode({**update, "updates": {"value": 0.5}}))
         until(lambda: control.value == 0.5)
-        assert control.max == 0.95
+        assert control.max == 1.0
         assert not shared, "a page is not brought to the internet because a client asks for it"
 
 
