@@ -121,10 +121,11 @@ def table(rows: Sequence[Row]) -> Table:
 
 
 def best_change(rows: Sequence[Row], name: str) -> str:
-    """The change of a rival, in words, with the highest mean PSNR over the recordings."""
+    """The change of a rival, in words, with the highest mean PSNR over the recordings; a dash where none has scores."""
     scores: dict[str, list[float]] = {}
     for row in rows:
         if row["method"] == name and row["scores"]:
             scores.setdefault(row["setting"], []).append(row["scores"]["psnr"])
-    most = max(map(len, scores.values()))
-    return max((change for change in scores if len(scores[change]) == most), key=lambda one: mean(scores[one]))
+    most = max(map(len, scores.values()), default=0)
+    most_tried = [change for change in scores if len(scores[change]) == most]
+    return max(most_tried, key=lambda one: mean(scores[one]), default="-")

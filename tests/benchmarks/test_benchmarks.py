@@ -53,7 +53,7 @@ def test_a_place_for_rows_that_cannot_be_is_said_before_anything_is_measured(
     [
         ("align --anchors 60,300 --outliers 0,0.4 --seeds 1 --seconds 0 --methods certified,RANSAC", 64, "gap 1e-10"),
         ("raster --scenes synth:30,synth:60 --sizes 24x16 --seconds 0 --no-memory", 4, "| d2 | synth:60 | 24x16 |"),
-        ("stereo --rigs synthetic2 --width 96 --makers patchmatch --defaults-only", 1, "| synthetic2 | 2 | 96x54 |"),
+        ("stereo --rigs synthetic2 --width 96 --defaults-only", 1, "| synthetic2 | 2 | 96x54 |"),
         ("scaling --frames 1,2 --width 96 --iterations 2", 4, "frames^"),
         ("stability --sweeps epsilon", 16, "| epsilon | float32 | smoothing over median depth: 1e-08 .. 0.1 | 8 | 8 |"),
     ],

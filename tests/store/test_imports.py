@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from mimics.workplace import furnish
 
-MOST = 44
+MOST = 45
 """Modules of this project in an attached process, its adapter among them; four of them are the store's."""
 
 OUTSIDE = ("d2_plugin.priors", "d2_plugin.recordings", "d2_plugin.runs", "d2_plugin.viewing", "d2_plugin.commands")
