@@ -156,3 +156,13 @@ def check_views(images: Sequence[np.ndarray], cameras: Sequence[Camera]) -> None
                 f"image of camera {camera.name} is {image.shape[1]}x{image.shape[0]} pixels but its calibration says "
                 f"{camera.width}x{camera.height}: resize the image or correct the camera"
             )
+
+
+def projected(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Pixels [K, 2] and planar depths [K] of world points [K, 3], and which of them the image holds."""
+    in_camera = points @ camera.T_camera_world[:3, :3].T + camera.T_camera_world[:3, 3]
+    depths = in_camera[:, 2]
+    front = depths > 0
+    pixels = (in_camera @ camera.K.T)[:, :2] / np.where(front, depths, 1)[:, None]
+    inside = (pixels >= 0).all(-1) & (pixels[:, 0] < camera.width) & (pixels[:, 1] < camera.height)
+    return pixels, depths, front & inside

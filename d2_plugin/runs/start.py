@@ -17,6 +17,7 @@ from torch import Tensor
 from d2_plugin.durable import opened_archive, write_archive
 from d2_plugin.errors import D2Error, MissingExtra
 from d2_plugin.priors.colmap.points import triangulate_frames
+from d2_plugin.priors.geometry import projected
 from d2_plugin.priors.stereo.depth_range import FEWEST
 from d2_plugin.protocol import View
 from d2_plugin.reading import parsing
@@ -219,9 +220,9 @@ def _seen_alone_beside(
 ) -> TimedPoints:
     """The points with those that no other camera sees at the depth of a triangulated one near by in the own image; as
     they are where the own camera sees too few of these."""
-    shown, depths, seen = _projected(own, triangulated.positions)
-    pixels, _, _ = _projected(own, drawn.positions)
-    alone = ~np.any([_projected(camera, drawn.positions)[2] for camera in others], axis=0) if others else None
+    shown, depths, seen = projected(own, triangulated.positions)
+    pixels, _, _ = projected(own, drawn.positions)
+    alone = ~np.any([projected(camera, drawn.positions)[2] for camera in others], axis=0) if others else None
     if alone is None or not alone.any() or np.count_nonzero(seen) < FEWEST:
         return drawn
     apart = np.linalg.norm(pixels[alone][:, None] - shown[seen][None], axis=-1)
@@ -232,16 +233,6 @@ def _seen_alone_beside(
     in_camera = positions[alone] @ rotation.T + translation
     positions[alone] = (in_camera * (depths[seen][chosen] / in_camera[:, 2])[:, None] - translation) @ rotation
     return replace(drawn, positions=positions)
-
-
-def _projected(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pixels [K, 2] and planar depths [K] of world points [K, 3], and which of them the image holds."""
-    in_camera = points @ camera.T_camera_world[:3, :3].T + camera.T_camera_world[:3, 3]
-    depths = in_camera[:, 2]
-    front = depths > 0
-    pixels = (in_camera @ camera.K.T)[:, :2] / np.where(front, depths, 1)[:, None]
-    inside = (pixels >= 0).all(-1) & (pixels[:, 0] < camera.width) & (pixels[:, 1] < camera.height)
-    return pixels, depths, front & inside
 
 
 def _random_points(

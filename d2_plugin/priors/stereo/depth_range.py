@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from d2_plugin.errors import D2Error
-from d2_plugin.priors.geometry import check_depth_range, scaled_camera, view_pair, viewing_rays
+from d2_plugin.priors.geometry import check_depth_range, projected, scaled_camera, view_pair, viewing_rays
 from d2_plugin.priors.stereo.settings import StereoSettings
 from d2_plugin.recordings.recording import Camera
 
@@ -40,8 +40,8 @@ def depth_bounds(
     Raises:
         D2Error: no range can be known, because all cameras stand at one point.
     """
-    depths = [] if points is None else [_visible_depths(camera, np.asarray(points, np.float64)) for camera in cameras]
-    depths = [values for values in depths if values.size >= FEWEST]
+    places = [] if points is None else [projected(camera, np.asarray(points, np.float64)) for camera in cameras]
+    depths = [values[seen] for _, values, seen in places if np.count_nonzero(seen) >= FEWEST]
     if depths:
         # COLMAP's own margins around the 1st and 99th percentile of the sparse depths (model.cc, ComputeDepthRanges).
         near = min(float(np.percentile(values, 1)) for values in depths) * 0.75
@@ -82,12 +82,3 @@ def _first_shared_depths(reference: Camera, source: Camera, far: float, max_angl
     cosine = (points * away).sum(-1) / (np.linalg.norm(points, axis=-1) * np.linalg.norm(away, axis=-1))
     alike = seen & (cosine > np.cos(np.deg2rad(max_angle)))
     return depths[alike.argmax(axis=0), 0][alike.any(axis=0)]
-
-
-def _visible_depths(camera: Camera, points: np.ndarray) -> np.ndarray:
-    local = points @ camera.T_camera_world[:3, :3].T + camera.T_camera_world[:3, 3]
-    pixels = local @ camera.K.T
-    with np.errstate(divide="ignore", invalid="ignore"):
-        x, y = pixels[:, 0] / pixels[:, 2], pixels[:, 1] / pixels[:, 2]
-    inside = (local[:, 2] > 0) & (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height)
-    return local[inside, 2]
