@@ -68,7 +68,7 @@ def run(settings: AlignBench) -> str:
     known = dict.fromkeys(method.name for method in every)
     refuse_unknown("alignment method", settings.methods, known)
     chosen = [method for method in every if not settings.methods or method.name in settings.methods]
-    command, rows = command_line("bench align", settings), list[Row]()
+    command, rows = command_line("python -m benchmarks align", settings), list[Row]()
     kinds: tuple[MonoKind, ...] = get_args(MonoKind)
     for case in (AlignCase(k, n, share) for k in kinds for n in settings.anchors for share in settings.outliers):
         problems = [align_problem(*case, seed=seed) for seed in range(settings.seeds)]

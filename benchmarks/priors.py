@@ -85,7 +85,7 @@ def run(settings: PriorsBench) -> str:
     """Measure and add the rows; a table per recording, and where the rows lie."""
     begin_rows(settings.output)
     torch.set_num_threads(settings.threads)
-    command, shown_text = command_line("bench priors", settings), []
+    command, shown_text = command_line("python -m benchmarks priors", settings), []
     prior_settings = PriorSettings(mono_onnx=settings.mono_onnx, mono_kind=settings.mono_kind)
     for case in cases(settings):
         found, seconds = measure(case, prior_settings)

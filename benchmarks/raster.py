@@ -62,7 +62,7 @@ def run(settings: RasterBench) -> str:
     names = [*settings.scenes, *(["garden"] if settings.garden and "garden" not in settings.scenes else [])]
     cases = [Case(name, *parse_size(size), settings.garden) for name in names for size in settings.sizes]
     begin_rows(settings.output)
-    command, rows = command_line("bench raster", settings), list[Row]()
+    command, rows = command_line("python -m benchmarks raster", settings), list[Row]()
     for case in cases:
         measured = _measure(case, settings, command)
         append_rows(settings.output, measured)

@@ -47,7 +47,7 @@ def run(settings: ScalingBench) -> str:
     """
     begin_rows(settings.output)
     width, iterations, rows = settings.width, settings.iterations, []
-    command = command_line("bench scaling", settings)
+    command = command_line("python -m benchmarks scaling", settings)
     with tempfile.TemporaryDirectory() as folder:
         for count in settings.frames:
             place = Path(folder) / str(count)

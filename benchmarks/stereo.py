@@ -58,7 +58,7 @@ def run(settings: StereoBench) -> str:
     }
     names = settings.rigs or (*RENDERED, *(FROM_DISK if settings.data else ()))
     about = {name: getattr(settings, name) for name in ("device", "repeats")}
-    about["command"] = command_line("bench stereo", settings)
+    about["command"] = command_line("python -m benchmarks stereo", settings)
     rows: list[Row] = []
     for group in [load_rigs(name, settings.data, settings.width) for name in names]:
         for name, variant in chosen.items():

@@ -72,7 +72,7 @@ def run(settings: TrainingStepBench) -> str:
         for width, height in map(parse_size, settings.sizes)
         for frames in settings.frames
     ]
-    command = command_line("bench training-step", settings)
+    command = command_line("python -m benchmarks training-step", settings)
     rows = [row for case in cases for row in measure(case, settings.seconds, not settings.no_memory, command)]
     append_rows(settings.output, rows)
     text = f"{markdown(table(rows))}\n\nD2's share of a step: {share(rows):.1%}"

@@ -164,7 +164,7 @@ def run(settings: GpuBench) -> str:
     """Run the steps; a table of what each came to, and where rows and outputs lie."""
     refuse_unknown("step", settings.steps, STEPS)
     make_folder(settings.output)
-    command = command_line("bench gpu", settings)
+    command = command_line("python -m benchmarks gpu", settings)
     rows = list[Row]()
     for name in settings.steps or STEPS:
         rows += (done := _run_step(name, settings, command))

@@ -116,7 +116,7 @@ def _works(settings: NeverWorseBench, text: str) -> Iterator[Work]:
         used = _with_maps(maps, case, own, network, folder)
         if used is not None:
             methods.append((maps, used, PRESETS["full"]))
-    command, target = command_line("bench never-worse", settings), f"{base.iterations} steps"
+    command, target = command_line("python -m benchmarks never-worse", settings), f"{base.iterations} steps"
     for method, given, preset in methods:
         name = method.replace(" ", "_")
         store = folder / "priors" / name

@@ -101,7 +101,7 @@ def _work(settings: RivalsSweep, case: Case, name: str, change: str, chosen: Pre
     used = replace(case.settings, hooks=(), overrides=chosen.merged({}))
     used = used if guidance is None else replace(used, priors=str(shared.priors))
     folder = shared.folder / "sweep" / name / (change.replace(" ", "_").replace(",", "") or "alone")
-    about = (case.name, name, command_line("bench rivals-sweep", settings), f"{settings.steps} steps")
+    about = (case.name, name, command_line("python -m benchmarks rivals-sweep", settings), f"{settings.steps} steps")
     return Work(used, folder, shared.points, *about, {"change": change}, kind="sweep", guidance=guidance)
 
 

@@ -208,4 +208,4 @@ def run(settings: RivalsBench) -> str:
     best = tuple(f"{name}_best" for name in RIVALS)
     tables = TABLES | {"rivals": ("backbone", *RIVALS, "full"), "rivals_best": ("backbone", *best, "full")}
     tables |= {"starts": ("backbone", "feed_forward", "feed_forward_d2", "full")}
-    return bench.run(settings, PRESETS | RIVAL_PRESETS, tables, "bench rivals")
+    return bench.run(settings, PRESETS | RIVAL_PRESETS, tables, "python -m benchmarks rivals")

@@ -44,7 +44,7 @@ class StabilitySettings(Settings):
 def run(settings: StabilitySettings) -> str:
     """Sweep and add the rows; the tables, and where the rows lie."""
     begin_rows(settings.output)
-    rows = run_sweeps(settings.sweeps, command_line("bench stability", settings))
+    rows = run_sweeps(settings.sweeps, command_line("python -m benchmarks stability", settings))
     append_rows(settings.output, rows)
     text = "\n\n".join(markdown(table) for _, table in tables(rows))
     return f"{text}\n\nrows are in {settings.output}; `python -m benchmarks report` draws them"

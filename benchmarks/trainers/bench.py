@@ -81,7 +81,7 @@ def rows_of(name: str, settings: TrainersBench) -> Iterator[Row]:
     trial = TRIALS[name]
     if not settings.recordings:
         raise D2Error("no recording to train on: give --recordings, each with cameras 00 to 07")
-    command = command_line("bench trainers", settings)
+    command = command_line("python -m benchmarks trainers", settings)
     for recording in settings.recordings:
         prepared = prepare(Source(recording.resolve(), settings.frames, settings.downscale), trial, settings.work)
         for seed in settings.seeds:

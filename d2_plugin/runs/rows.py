@@ -155,9 +155,9 @@ def _plain(value: Any) -> Any:
 
 
 def command_line(command: str, settings: Settings) -> str:
-    """`d2 COMMAND` with every setting that is not the default; of an absolute path the last part alone, since the rest
+    """The command with every setting that is not the default; of an absolute path the last part alone, since the rest
     says nothing about the measurement."""
-    words = ["d2", *command.split()]
+    words = command.split()
     for setting in declared(type(settings)):
         value = getattr(settings, setting.name)
         if value == setting.default:

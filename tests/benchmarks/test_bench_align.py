@@ -1,4 +1,4 @@
-"""`d2 bench align`, `raster` and `stability`: peers solve what they claim, scenes are what they are called."""
+"""`python -m benchmarks`: peers of the fit solve what they claim, scenes are what they are called."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`d2 bench stereo`, `priors` and `never-worse`: scores are what they are called, maps are spoiled as said."""
+"""`python -m benchmarks`: scores of stereo and priors are what they are called, maps are spoiled as said."""
 
 from __future__ import annotations
 
@@ -127,9 +127,8 @@ def test_a_rendered_rig_is_measured_without_any_data(measured: tuple[str, list[R
     assert 0.2 < motion["motion_right"] < motion["motion_known"] < 1
     assert motion["motion_psnr"] > 15
     assert 0 < motion["motion_within"] < motion["motion_within_two"] < 1
-    assert rows[0]["command"] == ("d2 bench priors --rigs synthetic4 --frames 0 --width 96 --output runs.jsonl"), (
-        "no folder of this machine"
-    )
+    line = "python -m benchmarks priors --rigs synthetic4 --frames 0 --width 96 --output runs.jsonl"
+    assert rows[0]["command"] == line, "no folder of this machine"
 
 
 def test_what_cannot_be_compared_is_refused_in_a_sentence(folder: Path, tmp_path: Path) -> None:

@@ -72,7 +72,8 @@ def test_a_part_adds_rows_of_what_it_measured_and_prints_their_tables(
     assert shown in capsys.readouterr().out
     found = read_rows([tmp_path / "rows.jsonl"])
     assert len(found) == rows
-    assert all(row["failed"] is None and row["command"].startswith(f"d2 bench {words.split()[0]}") for row in found)
+    begins = f"python -m benchmarks {words.split()[0]}"
+    assert all(row["failed"] is None and row["command"].startswith(begins) for row in found)
 
 
 # ---------------------------------------------------------------- the page

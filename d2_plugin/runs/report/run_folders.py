@@ -32,7 +32,7 @@ def training_row(folder: Path) -> Row:
     settings = RunSettings.from_table(table, str(folder / "run.json"))
     scores, seconds = metrics["test"] or {}, metrics["seconds"]
     typed = replace(settings, hooks=settings.hooks or ("none",), overrides={}, protocol=None)
-    command = command_line("train", typed) + (" --config TABLES" if settings.overrides else "")
+    command = command_line("d2 train", typed) + (" --config TABLES" if settings.overrides else "")
     row = make_row(
         "training",
         case_name(metrics["recording"], settings),

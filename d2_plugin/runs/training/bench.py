@@ -85,7 +85,7 @@ def run(
     settings: TrainingBench,
     presets: Mapping[str, Preset] = PRESETS,
     tables: Mapping[str, Sequence[str]] = TABLES,
-    name: str = "bench training",
+    name: str = "d2 bench training",
     about: Mapping[str, Any] | None = None,
 ) -> str:
     """Measure what is missing; where the rows lie.
