@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import torch
 from torch import Tensor
@@ -18,6 +18,12 @@ AT_LEAST = 10
 """Steps from one evaluation to the next in a short run. Training closes a hole in some ten steps however long the run
 is; evaluations that follow each other sooner judge by the same evidence, and dig before the hole is closed."""
 
+FLOATS = 0.4
+"""A Gaussian floats where its trusted light, times how deep in free space it stands, is more than this share of it."""
+
+LEAST_LIGHT = 2e-5
+"""That light, as a share of all of the evaluation, below which a Gaussian is too small to be worth a hole."""
+
 
 @dataclass(frozen=True)
 class PruneConfig(HookConfig):
@@ -25,8 +31,11 @@ class PruneConfig(HookConfig):
 
     start: Steps = 300
     """First step at which it may run."""
-    stop: Steps | None = 2000
+    stop: Steps | None = 3000
     """First step at which it no longer runs."""
+    score_stop: Steps | None = 2000
+    """First step from which scores remove nothing more. What floats in free space goes until `stop`, however opaque it
+    is, which the paper's score forgives: it is little, and hides much from a camera that did not train."""
     every: Every = 100
     """Steps between evaluations."""
     tau_u: Annotated[float, Range(1e-6, 1e6)] = 0.1
@@ -38,7 +47,8 @@ class PruneConfig(HookConfig):
     patience: Annotated[int, Range(1, 1000)] = 5
     """Evaluations in a row, each with evidence, before a Gaussian is removed."""
     free_space: bool = True
-    """Whether standing in space that the prior says is free counts as inconsistency too; the paper has no such term."""
+    """Whether standing in space that the prior says is free counts as inconsistency too, and after `score_stop` removes;
+    the paper has no such term."""
     light: Share = 0.05
     """Largest share of the light in the surveyed views that one evaluation takes away: the faintest go first, the rest
     waits with its evidence for the next. 1 sets no limit, as the paper. What a random start has in front of every
@@ -46,10 +56,11 @@ class PruneConfig(HookConfig):
 
     @classmethod
     def for_iterations(cls, iterations: int) -> PruneConfig:
-        """Pruning from a fifth to two thirds of the run: the last third only refines. Runs of less than about a hundred
-        iterations are too short to gather evidence in, and nothing is pruned there."""
+        """Pruning from a fifth to two thirds of the run, and of what floats to the last twentieth: the rest only refines.
+        Runs of less than about a hundred iterations are too short to gather evidence in, and nothing is pruned there."""
         every = steps_between_evaluations(iterations, AT_LEAST)
-        return cls(start=iterations // 5, stop=2 * iterations // 3, every=every)
+        score_stop, stop = 2 * iterations // 3, 19 * iterations // 20
+        return cls(start=iterations // 5, stop=stop, score_stop=score_stop, every=every)
 
 
 def depth_inconsistency(error: Tensor, weight: Tensor, tau_u: float) -> Tensor:
@@ -78,21 +89,35 @@ def pruning_score(inconsistency: Tensor, contribution: Tensor, lambda_e: float) 
     return lambda_e * inconsistency + (1 - lambda_e) * (1 - contribution)
 
 
-def gather(evaluation: Sequence[Surveyed], count: int, free_space: bool) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Sum the surveys of several views per Gaussian: error, weight, weight maxima, observations, each [count].
+class Sums(NamedTuple):
+    """The surveys of several views, summed per Gaussian: each [N]."""
 
-    Weight in free space, times how deep in it 1 - z / D_near, is evidence with the relative error 1.
-    """
-    error, weight, maxima, observations = evaluation[0].survey.weight.new_zeros(4, count)
+    error: Tensor
+    weight: Tensor
+    maxima: Tensor
+    observations: Tensor
+    front: Tensor
+    """Weight in free space, times how deep in it 1 - z / D_near: evidence with the relative error 1, in `error` and
+    `weight` as well."""
+
+
+def gather(evaluation: Sequence[Surveyed], count: int, free_space: bool) -> Sums:
+    """Sum the surveys of several views per Gaussian."""
+    error, weight, maxima, observations, front = evaluation[0].survey.weight.new_zeros(5, count)
     for _, splats, _, survey in evaluation:
         if free_space:
-            error.index_add_(0, splats.rows, survey.front)
-            weight.index_add_(0, splats.rows, survey.front)
+            front.index_add_(0, splats.rows, survey.front)
         error.index_add_(0, splats.rows, survey.error)
         weight.index_add_(0, splats.rows, survey.weight)
         maxima.index_add_(0, splats.rows, survey.max_weight)
         observations.index_add_(0, splats.rows, (survey.max_weight > 0).to(maxima))
-    return error, weight, maxima, observations
+    return Sums(error + front, weight + front, maxima, observations, front)
+
+
+def floating(sums: Sums) -> Tensor:
+    """Gaussians [N] whose light stands deep in free space, bool: whatever they contribute there hides a surface."""
+    enough = sums.front > LEAST_LIGHT * sums.weight.sum(dtype=torch.float64)
+    return enough & (sums.front > FLOATS * (sums.weight - sums.front))
 
 
 def within_light(remove: Tensor, weight: Tensor, share: float) -> Tensor:
@@ -122,15 +147,18 @@ class Prune(Hook):
         if not context.evaluation:
             return None
         config, count = self.config, len(context.backbone)
-        error, weight, maxima, observations = gather(context.evaluation, count, config.free_space)
-        inconsistency = depth_inconsistency(error, weight, config.tau_u)
-        contribution = opacity_contribution(maxima, observations)
-        high = pruning_score(inconsistency, contribution, config.lambda_e) > config.tau_p
+        sums = gather(context.evaluation, count, config.free_space)
+        if config.score_stop is None or context.step < config.score_stop:
+            inconsistency = depth_inconsistency(sums.error, sums.weight, config.tau_u)
+            contribution = opacity_contribution(sums.maxima, sums.observations)
+            high = pruning_score(inconsistency, contribution, config.lambda_e) > config.tau_p
+        else:
+            high = floating(sums)
         if self.streak is None:
-            self.streak = torch.zeros(count, dtype=torch.int64, device=weight.device)
+            self.streak = torch.zeros(count, dtype=torch.int64, device=high.device)
         updated = torch.where(high, self.streak + 1, torch.zeros_like(self.streak))
-        self.streak = torch.where(weight > 0, updated, self.streak)
-        remove = within_light(self.streak >= config.patience, weight, config.light)
+        self.streak = torch.where(sums.weight > 0, updated, self.streak)
+        remove = within_light(self.streak >= config.patience, sums.weight, config.light)
         return Edit(remove=remove) if remove.any() else None
 
     def follow(self, index: Tensor) -> None:

@@ -29,7 +29,9 @@ from d2_plugin.hooks.hook import FREE_SIGMAS, Context
 from d2_plugin.hooks.prior import PriorLoader
 from d2_plugin.hooks.prune import (
     Prune,
+    Sums,
     depth_inconsistency,
+    floating,
     gather,
     opacity_contribution,
     pruning_score,
@@ -108,7 +110,7 @@ def test_the_scores_are_the_papers(seed: int, with_sigma: bool) -> None:
     found = context(splats, views, prior)
     sums = gather(found.evaluation, 40, config.free_space)
     torch.testing.assert_close(depth_inconsistency(*sums[:2], 0.1), inconsistency, rtol=1e-7, atol=1e-9)
-    torch.testing.assert_close(opacity_contribution(*sums[2:]), contribution, rtol=1e-7, atol=1e-9)
+    torch.testing.assert_close(opacity_contribution(sums.maxima, sums.observations), contribution, rtol=1e-7, atol=1e-9)
     edit = Prune(replace(config, tau_p=0.7)).edit(found)
     assert torch.equal(edit.remove, (score > 0.7) & (total > 0))
     assert 0 < int(edit.remove.sum()) < 40
@@ -187,6 +189,39 @@ def test_without_the_term_only_the_papers_evidence_counts() -> None:
     assert [removed(hook, bands()) for _ in range(4)] == [set(), set(), {"before the surface"}, {"before the surface"}]
     with_term = Prune(PruneConfig(patience=1, light=1))
     assert removed(with_term, bands()._replace(sigma=None)) == {"before the surface"}
+
+
+def opaque(view: View) -> Splats:
+    """The cast, too opaque for the paper's score."""
+    return cast(view)._replace(opacities=torch.full((6,), 0.95))
+
+
+def test_what_is_opaque_in_free_space_goes_once_scores_have_ended() -> None:
+    """O_k is near 1, so S_k stays at a half however wrong its depth is: the paper's score never removes it."""
+    view = make_views()[0]
+
+    def gone(config: PruneConfig, splats: Splats) -> set[str]:
+        hook, evaluation = Prune(config), context(splats, [view], bands())
+        edits = [hook.edit(evaluation) for _ in range(3)]
+        assert edits[:2] == [None, None], "patience"
+        return set() if edits[2] is None else {name for name, out in zip(CAST, edits[2].remove, strict=True) if out}
+
+    scores, floats = PruneConfig(patience=3, light=1), PruneConfig(patience=3, light=1, score_stop=1)
+    assert gone(scores, opaque(view)) == set()
+    assert gone(floats, opaque(view)) == FLOATING
+    assert gone(replace(floats, free_space=False), opaque(view)) == set()
+    assert gone(replace(floats, stop=5), cast(view)) == FLOATING, "faint ones as well"
+
+
+def test_what_is_too_small_to_see_is_no_floater() -> None:
+    """The same Gaussian, deep in free space, beside much light of others and beside less."""
+
+    def first_floats(others: float) -> bool:
+        error, weight, front = torch.tensor([[1.0, 0], [1.0, others], [0.6, 0]])
+        return bool(floating(Sums(error, weight, torch.ones(2), torch.ones(2), front))[0])
+
+    assert not first_floats(1e5)
+    assert first_floats(1e4)
 
 
 def test_the_sums_are_those_of_the_two_kinds_of_evidence() -> None:
