@@ -288,9 +288,9 @@ class D2Hooks:
             return self._sampler.sample(max(self.config.views_per_evaluation, first), self.generator)
 
         assert self.prior is not None, "a step without hooks has no context"
-        instants, motion = self._sampler.instants, self.config.motion
+        known, motion = self._sampler.known, self.config.motion
         halfway = motion is not None and motion.insert
-        return Context(step, self.backbone, views, self.prior, self.generator, sample, instants, halfway)
+        return Context(step, self.backbone, views, self.prior, self.generator, sample, known, halfway)
 
     def _retire_if_idle(self, step: int, name: str, edit: Edit | None, context: Context) -> None:
         if name not in HOOKS or not HOOKS[name].edits_structure or not context.evaluation:

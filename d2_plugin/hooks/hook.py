@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, NamedTuple, TypeVar
@@ -63,10 +63,6 @@ def steps_between_evaluations(iterations: int, least: int) -> int:
     return max(least, min(100, iterations // 20))
 
 
-def _none_known(_: str) -> Sequence[View]:
-    return ()
-
-
 class Surveyed(NamedTuple):
     """One view of an evaluation: its sliced Gaussians, its prior, and the compositing weights."""
 
@@ -88,10 +84,14 @@ class Context:
     generator: torch.Generator
     sample: Callable[[], Sequence[View]] = field(default=tuple)
     """The views to evaluate when structure is edited: a stratified sample of all training views."""
-    instants: Callable[[str], Sequence[View]] = _none_known
-    """The views of a camera that were trained on so far, in the order in which they were first seen."""
+    known: Callable[[], Collection[View]] = tuple
+    """All views that were trained on so far, in the order in which they were first seen."""
     inserts_halfway: bool = False
     """Whether `halfway` is evaluated as well."""
+
+    def instants(self, camera: str) -> list[View]:
+        """Those of one camera."""
+        return [view for view in self.known() if view.camera == camera]
 
     @cached_property
     def evaluation(self) -> list[Surveyed]:

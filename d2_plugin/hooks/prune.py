@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, NamedTuple
 
@@ -11,7 +11,8 @@ from torch import Tensor
 
 from d2_plugin.hooks.hook import Context, Hook, HookConfig, Surveyed, steps_between_evaluations
 from d2_plugin.hooks.rendered_depth import EPSILON
-from d2_plugin.protocol import Edit
+from d2_plugin.protocol import Backbone, DepthPrior, Edit, View
+from d2_plugin.rasterizer import survey
 from d2_plugin.settings import Every, Range, Share, Steps
 
 AT_LEAST = 10
@@ -24,6 +25,9 @@ FLOATS = 0.4
 LEAST_LIGHT = 2e-5
 """That light, as a share of all of the evaluation, below which a Gaussian is too small to be worth a hole."""
 
+STEPS_PER_VIEW = 4
+"""Steps for each training view that a run has had before what is seen nowhere goes."""
+
 
 @dataclass(frozen=True)
 class PruneConfig(HookConfig):
@@ -34,8 +38,9 @@ class PruneConfig(HookConfig):
     stop: Steps | None = 3000
     """First step at which it no longer runs."""
     score_stop: Steps | None = 2000
-    """First step from which scores remove nothing more. What floats in free space goes until `stop`, however opaque it
-    is, which the paper's score forgives: it is little, and hides much from a camera that did not train."""
+    """First step from which scores remove nothing more. What no view shows goes then, once, and until `stop` what
+    floats in free space, however opaque it is: the paper's score forgives that, and a camera that did not train may see
+    little else."""
     every: Every = 100
     """Steps between evaluations."""
     tau_u: Annotated[float, Range(1e-6, 1e6)] = 0.1
@@ -47,8 +52,11 @@ class PruneConfig(HookConfig):
     patience: Annotated[int, Range(1, 1000)] = 5
     """Evaluations in a row, each with evidence, before a Gaussian is removed."""
     free_space: bool = True
-    """Whether standing in space that the prior says is free counts as inconsistency too, and after `score_stop` removes;
-    the paper has no such term."""
+    """Whether standing in space that the prior says is free counts as inconsistency too, and removes after
+    `score_stop`; the paper has no such term."""
+    unseen: Share = 0.02
+    """Compositing weight that a Gaussian reaches in some pixel of some training view, or goes at `score_stop`; 0: all
+    stay. Runs with less than four steps for each view have not shown each what it needs, and all stay there as well."""
     light: Share = 0.05
     """Largest share of the light in the surveyed views that one evaluation takes away: the faintest go first, the rest
     waits with its evidence for the next. 1 sets no limit, as the paper. What a random start has in front of every
@@ -56,8 +64,8 @@ class PruneConfig(HookConfig):
 
     @classmethod
     def for_iterations(cls, iterations: int) -> PruneConfig:
-        """Pruning from a fifth to two thirds of the run, and of what floats to the last twentieth: the rest only refines.
-        Runs of less than about a hundred iterations are too short to gather evidence in, and nothing is pruned there."""
+        """Pruning from a fifth to two thirds of the run, then of what floats up to the last twentieth. Runs of less
+        than about a hundred iterations are too short to gather evidence in, and nothing is pruned there."""
         every = steps_between_evaluations(iterations, AT_LEAST)
         score_stop, stop = 2 * iterations // 3, 19 * iterations // 20
         return cls(start=iterations // 5, stop=stop, score_stop=score_stop, every=every)
@@ -104,13 +112,13 @@ class Sums(NamedTuple):
 def gather(evaluation: Sequence[Surveyed], count: int, free_space: bool) -> Sums:
     """Sum the surveys of several views per Gaussian."""
     error, weight, maxima, observations, front = evaluation[0].survey.weight.new_zeros(5, count)
-    for _, splats, _, survey in evaluation:
+    for _, splats, _, found in evaluation:
         if free_space:
-            front.index_add_(0, splats.rows, survey.front)
-        error.index_add_(0, splats.rows, survey.error)
-        weight.index_add_(0, splats.rows, survey.weight)
-        maxima.index_add_(0, splats.rows, survey.max_weight)
-        observations.index_add_(0, splats.rows, (survey.max_weight > 0).to(maxima))
+            front.index_add_(0, splats.rows, found.front)
+        error.index_add_(0, splats.rows, found.error)
+        weight.index_add_(0, splats.rows, found.weight)
+        maxima.index_add_(0, splats.rows, found.max_weight)
+        observations.index_add_(0, splats.rows, (found.max_weight > 0).to(maxima))
     return Sums(error + front, weight + front, maxima, observations, front)
 
 
@@ -118,6 +126,19 @@ def floating(sums: Sums) -> Tensor:
     """Gaussians [N] whose light stands deep in free space, bool: whatever they contribute there hides a surface."""
     enough = sums.front > LEAST_LIGHT * sums.weight.sum(dtype=torch.float64)
     return enough & (sums.front > FLOATS * (sums.weight - sums.front))
+
+
+@torch.no_grad()
+def largest_weights(backbone: Backbone, views: Collection[View]) -> Tensor:
+    """The largest compositing weight [N] that each Gaussian has in any pixel of any of the views."""
+    largest = torch.zeros(len(backbone))
+    for view in views:
+        splats = backbone.slice_at(view)
+        nothing = splats.means.new_zeros(view.height, view.width)
+        weights = survey(splats, view, DepthPrior(nothing, nothing.byte()), backbone.settings).max_weight
+        largest = largest.to(weights)
+        largest[splats.rows] = torch.maximum(largest[splats.rows], weights)
+    return largest
 
 
 def within_light(remove: Tensor, weight: Tensor, share: float) -> Tensor:
@@ -159,7 +180,15 @@ class Prune(Hook):
         updated = torch.where(high, self.streak + 1, torch.zeros_like(self.streak))
         self.streak = torch.where(sums.weight > 0, updated, self.streak)
         remove = within_light(self.streak >= config.patience, sums.weight, config.light)
+        if self._looks_everywhere(context):
+            remove = remove | (largest_weights(context.backbone, context.known()) < config.unseen)
         return Edit(remove=remove) if remove.any() else None
+
+    def _looks_everywhere(self, context: Context) -> bool:
+        """Whether this is the first evaluation after scores have ended, of a run that has shown each view often."""
+        end = self.config.score_stop
+        first = end is not None and 0 <= context.step - end < self.config.every
+        return first and self.config.unseen > 0 and 0 < STEPS_PER_VIEW * len(context.known()) <= context.step
 
     def follow(self, index: Tensor) -> None:
         """Streaks move with their Gaussians; new ones start at 0."""

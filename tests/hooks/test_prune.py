@@ -213,6 +213,36 @@ def test_what_is_opaque_in_free_space_goes_once_scores_have_ended() -> None:
     assert gone(replace(floats, stop=5), cast(view)) == FLOATING, "faint ones as well"
 
 
+def test_what_no_view_shows_goes_once_scores_have_ended() -> None:
+    """A Gaussian that is hidden behind an opaque one in each view, one that is out of all of them, and one in plain
+    sight; only the last view shows a fourth one."""
+    front, last = make_views()[0], replace(make_views()[0], camera="aside", time=1.0)
+    means = torch.tensor([[0.0, 0, 2], [0, 0, 3], [0, 0, -5], [0.5, 0, 2]])
+    splats = Splats(means, 0.01 * torch.tensor([1.0, 0, 0, 1, 0, 1]).repeat(4, 1), torch.ones(4), torch.arange(4))
+    splats = splats._replace(opacities=torch.tensor([0.99, 0.02, 0.9, 0.9]))
+
+    class Appears(Fixed):
+        def slice_at(self, view: View) -> Splats:
+            return (
+                self.splats
+                if view.time == last.time
+                else self.splats._replace(**{name: value[:3] for name, value in self.splats._asdict().items()})
+            )
+
+    def gone(step: int, rounds: int = 1, **settings: float) -> list[bool]:
+        loader = PriorLoader(SimpleNamespace(prior=lambda camera, frame: bands()))
+        views = [front, last] * rounds
+        config = PruneConfig(every=10, score_stop=20, **settings)
+        found = Context(step, Appears(splats), [], loader, torch.Generator(), lambda: views[:1], lambda: views)
+        edit = Prune(config).edit(found)
+        return [False] * 4 if edit is None else edit.remove.tolist()
+
+    stays = [False] * 4
+    assert gone(20) == gone(29) == [False, True, True, False]
+    assert gone(19) == gone(30) == gone(20, unseen=0) == stays, "once, and not where it is switched off"
+    assert gone(20, rounds=3) == stays, "each view was shown three times at most"
+
+
 def test_what_is_too_small_to_see_is_no_floater() -> None:
     """The same Gaussian, deep in free space, beside much light of others and beside less."""
 
