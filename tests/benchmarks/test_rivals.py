@@ -14,14 +14,13 @@ from numpy.lib.stride_tricks import sliding_window_view
 from tiny import BACKBONES, TinyStore, make_adapter, make_model, make_views
 from torch import Tensor
 
-from benchmarks.rivals.dense_start import DenseStartConfig, back_projected
-from benchmarks.rivals.inputs import expected_depth
+from benchmarks.rivals.dense_start import back_projected
 from benchmarks.rivals.patch_norm import PatchNorm, PatchNormConfig, hard_and_soft, patch_norm_loss
 from benchmarks.rivals.pearson import PearsonConfig, pearson_depth_loss
 from benchmarks.rivals.scale_shift import scale_shift_loss
 from benchmarks.rivals.sparse_points import Seen, sparse_point_loss
 from benchmarks.rivals.sweep import best_change
-from benchmarks.rivals.table import RIVAL_PRESETS, RIVALS, Change, guidance
+from benchmarks.rivals.table import RIVAL_PRESETS, RIVALS, guidance
 from d2_plugin import D2Config, D2Hooks
 from d2_plugin.errors import D2Error
 from d2_plugin.hooks import Context, Hook, HookConfig
@@ -154,19 +153,6 @@ def test_where_nothing_can_be_told_there_is_no_gradient(name: str, dtype: torch.
     assert (d.grad == 0).all()
 
 
-@pytest.mark.parametrize("whole", [True, False])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("depth", [FLAT, np.zeros_like(FLAT), FLAT[:3, :3], FLAT[:1, :1]])
-def test_patch_norm_of_constant_and_tiny_maps_has_finite_gradients(
-    depth: np.ndarray, dtype: torch.dtype, whole: bool
-) -> None:
-    d = tensor(depth).to(dtype).requires_grad_()
-    loss = patch_norm_loss(d, tensor(-MONO[: depth.shape[0], : depth.shape[1]]).to(dtype), 5, 0.0, whole)
-    loss.backward()
-    assert loss.isfinite()
-    assert d.grad.isfinite().all()
-
-
 class OneMap:
     """What `Inputs` knows of depth: a slope."""
 
@@ -219,15 +205,6 @@ def test_no_depth_counts_as_infinitely_far_and_no_point_as_nothing() -> None:
     assert loss.item() == pytest.approx((1 / SEEN[1]).mean().item())
     assert (d.grad == 0).all()
     assert sparse_point_loss(d, Seen(tensor(np.zeros((0, 2))), tensor(np.zeros(0))), 1.0).item() == 0
-
-
-def test_expected_depth_is_zero_without_gradient_where_little_is_drawn() -> None:
-    alpha = torch.tensor([0.0, 0.4, 0.8], dtype=torch.float64, requires_grad=True)
-    depth, valid = expected_depth(torch.tensor([0.0, 1.0, 2.0], dtype=torch.float64), alpha)
-    assert depth.tolist() == [0, 0, 2.5]
-    assert valid.tolist() == [False, False, True]
-    depth.sum().backward()
-    assert alpha.grad.tolist()[:2] == [0, 0]
 
 
 def test_back_projected_points_project_onto_their_pixels_with_their_colours() -> None:
@@ -290,10 +267,6 @@ class TestOnARecording:
             assert metrics["guidance"]["name"] == name
             assert metrics["cpu_seconds"]["train"] > 0
 
-    def test_rivals_change_the_run_and_the_dense_one_starts_with_more(self, ablation: Path) -> None:
-        scores = {path.parts[-3]: json.loads(path.read_text()) for path in ablation.rglob("metrics.json")}
-        assert len({metrics["test"]["psnr"] for metrics in scores.values()}) == len(scores)
-
     def test_a_dense_start_adds_stereo_points_to_the_triangulated_ones(self, ablation: Path) -> None:
         run = run_of(ablation, "dense_start")
         points = run.prepare()
@@ -330,14 +303,6 @@ class TestOnARecording:
 
 
 class TestAtTheirBest:
-    def test_a_change_scales_the_weight_and_ends_the_loss(self) -> None:
-        changed = Change(0.1, 0.5).of(PearsonConfig.for_iterations(400), 400)
-        assert changed.weight == pytest.approx(0.005)
-        assert changed.window.due(200)
-        assert not changed.window.due(201)
-        assert Change(2.0).of(DenseStartConfig(), 400).density == pytest.approx(0.36)
-        assert str(Change(0.1, 0.5)) == "0.1 times, first 50%"
-
     @pytest.mark.parametrize("name", RIVALS)
     def test_the_best_is_that_of_the_sweep(self, name: str) -> None:
         """No weight of a table is chosen by hand."""
