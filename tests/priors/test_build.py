@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import importlib.util
 import os
 import signal
@@ -479,10 +480,12 @@ def test_a_worker_killed_in_the_middle_changes_no_byte_of_the_store(
 
 @needs_dask
 def test_what_a_single_build_refuses_the_cluster_refuses_in_the_same_words(
-    shared_room: Recording, two_workers: object, tmp_path: Path
+    shared_room: Recording, two_workers: object, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with pytest.raises(D2Error, match="unknown camera 'train7'.*did you mean"):
         build_priors_on_cluster(shared_room, ["train7"], tmp_path / "p", DASK, scheduler=two_workers.scheduler_address)
+    client = importlib.import_module("distributed").Client
+    monkeypatch.setattr("distributed.Client", lambda at, timeout, **more: client(at, timeout="0.2s", **more))
     with pytest.raises(D2Error, match="no dask scheduler answers at tcp://127.0.0.1:1 "):
         build_priors_on_cluster(shared_room, DASK_NAMES, tmp_path / "p", DASK, scheduler="tcp://127.0.0.1:1")
     with pytest.raises(D2Error, match="give at least 1"):
