@@ -268,9 +268,7 @@ class TestPrebuilt:
     """Kernels that came compiled with a wheel: the right ones for this CPU, whole ones only, no compiler needed."""
 
     @pytest.fixture(autouse=True)
-    def wheel(
-        self, tmp_path: Path, source: Path, libraries: dict[str, bytes], monkeypatch: pytest.MonkeyPatch
-    ) -> Path:
+    def wheel(self, tmp_path: Path, source: Path, libraries: dict[str, bytes], monkeypatch: pytest.MonkeyPatch) -> Path:
         """A package with a library for each level."""
         source.write_text('extern "C" int answer() { return 42; }\n')
         wheel = tmp_path / "compiled"

@@ -28,8 +28,7 @@ from d2_plugin.priors.settings import PriorSettings, StereoSettings
 from d2_plugin.priors.stereo import matched_depth
 from d2_plugin.priors.stereo.depth_range import DepthBounds
 from d2_plugin.priors.stereo.filtering.filter import GeometricDepth
-from d2_plugin.priors.stereo.geometric_depth import geometric_depth
-from d2_plugin.priors.stereo.reuse import RADIUS, MatchMemory, changed
+from d2_plugin.priors.stereo.reuse import RADIUS, changed
 from d2_plugin.protocol import Label
 from d2_plugin.recordings import open_recording
 from d2_plugin.recordings.export.folder import save_recording
@@ -357,16 +356,6 @@ def test_a_change_is_what_outlasts_noise_and_its_neighbourhood_changes_with_it()
     mask = changed(moved, before)
     assert mask[30 - RADIUS : 34 + RADIUS, 40 - RADIUS : 44].all()
     assert not mask[:15].any()
-
-
-def test_a_scene_that_stands_still_is_matched_once() -> None:
-    still = synthetic_recording(cameras=2, held_out=0, frames=2, width=128, height=72, arc_degrees=10, moving=False)
-    memories, results = [MatchMemory(), MatchMemory()], []
-    for frame in still.frames:
-        images = [still.image(name, frame) for name in STILL_NAMES]
-        results.append(geometric_depth(images, list(still.cameras.values()), (2, 9), STEREO, memories=memories))
-    assert [memory.matched_share for memory in memories] == [0, 0]
-    np.testing.assert_array_equal(results[0][0].depth, results[1][0].depth)
 
 
 def test_the_share_that_was_matched_is_recorded_and_small(still_built: Path) -> None:
