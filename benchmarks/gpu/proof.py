@@ -4,8 +4,6 @@ Each step has a time limit of its own and leaves its output and a row as soon as
 half an hour loses nothing. A step that cannot run here says why in one sentence; what needs no device runs without one.
 """
 
-from __future__ import annotations
-
 import logging
 import os
 import shutil
