@@ -101,7 +101,7 @@ def _sanitizer(tool: str) -> Step:
 
 
 def _raster(settings: GpuBench) -> list[str]:
-    sizes = ("--sizes", "640x360", "1920x1080", "--scenes", "synth:50000", "synth:200000", "synth:1000000")
+    sizes = ("--sizes", "640x360,1920x1080", "--scenes", "synth:50000,synth:200000,synth:1000000")
     kind = ("--device", "cuda", "--seconds", "2", "--error-limit", "60000")
     return _part("raster", *kind, *sizes, "--output", str(settings.output / "raster.jsonl"))
 

@@ -152,19 +152,3 @@ def test_a_spoiled_recording_differs_in_its_maps_alone(room: Path, tmp_path: Pat
             assert np.array_equal(after.depth(camera, frame), before.depth(camera, frame))
             assert not np.array_equal(after.mono(camera, frame), before.mono(camera, frame))
     assert after.mono(list(before.cameras)[2], before.frames[0]) is None, "a camera that does not train needs no map"
-
-
-def test_each_map_is_what_its_name_says(room: Path, tmp_path: Path) -> None:
-    before = open_recording(room)
-    cameras = list(before.cameras)[:2]
-
-    def spoiled(kind: Spoiled, frames: tuple[int, ...] | None = None, folder: str = "all") -> np.ndarray:
-        path = spoiled_recording(room, cameras, frames, kind, tmp_path / folder, PriorSettings())
-        return open_recording(path).mono(cameras[0], 0)
-
-    assert np.ptp(spoiled("constant")) == 0
-    assert np.std(np.diff(spoiled("noise", folder="noise"))) > 2 * np.std(np.diff(spoiled("smooth", folder="smooth")))
-    other = spoiled("other", folder="other")
-    assert np.allclose(other, before.mono(cameras[0], before.frames[1]), atol=1e-2)
-    alone = spoiled("other", (0,), "one frame")
-    assert np.allclose(alone, before.mono(cameras[1], 0), atol=1e-2), "with one frame it is another camera's"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,9 +13,8 @@ from numpy.lib.stride_tricks import sliding_window_view
 from tiny import BACKBONES, TinyStore, make_adapter, make_model, make_views
 from torch import Tensor
 
-from benchmarks.rivals.dense_start import back_projected
 from benchmarks.rivals.patch_norm import PatchNorm, PatchNormConfig, hard_and_soft, patch_norm_loss
-from benchmarks.rivals.pearson import PearsonConfig, pearson_depth_loss
+from benchmarks.rivals.pearson import pearson_depth_loss
 from benchmarks.rivals.scale_shift import scale_shift_loss
 from benchmarks.rivals.sparse_points import Seen, sparse_point_loss
 from benchmarks.rivals.sweep import best_change
@@ -120,16 +118,6 @@ def test_gradients_are_those_of_the_loss(name: str) -> None:
     torch.autograd.gradcheck(loss, tensor(at, True))
 
 
-def test_the_global_deviation_of_patch_norm_has_no_gradient() -> None:
-    """Scaling the render changes the loss through the centred values alone: the divisor is held."""
-    d, x, fixed = tensor(DEPTH, True), tensor(DEPTH, True), DEPTH.std(ddof=1)
-    patch_norm_loss(d, tensor(-MONO), 5, 0.0, True).backward()
-    cut = torch.stack([x[i : i + 5, j : j + 5].flatten() for i in range(0, 20, 5) for j in range(0, 30, 5)])
-    mine = (cut - cut.mean(1, keepdim=True)) / (fixed + 0.01 * cut.std())
-    (mine - tensor(normalised(-MONO, True))).square().mean().backward()
-    torch.testing.assert_close(d.grad, x.grad, rtol=1e-9, atol=1e-12)
-
-
 DEGENERATE: dict[str, tuple[Callable[[Tensor], Tensor], np.ndarray, float | None]] = {
     "pearson, flat render": (lambda d: pearson_depth_loss(d, tensor(MONO).to(d)), FLAT, 1),
     "pearson, flat map": (lambda d: pearson_depth_loss(d, tensor(FLAT).to(d)), DEPTH, 1),
@@ -189,36 +177,6 @@ def test_hard_depth_draws_what_ends_fainter(backbone: str) -> None:
     torch.testing.assert_close(hard.opacities, 0.95 * alive)
     torch.testing.assert_close(soft.opacities, splats.opacities)
     assert torch.equal(hard.means, splats.means)
-
-
-def test_pixels_without_a_map_do_not_count() -> None:
-    d = tensor(DEPTH, True)
-    pearson_depth_loss(d, tensor(np.where(MASK, MONO, np.nan))).backward()
-    assert (d.grad[~tensor(MASK)] == 0).all()
-    assert torch.isfinite(d.grad).all()
-
-
-def test_no_depth_counts_as_infinitely_far_and_no_point_as_nothing() -> None:
-    d = tensor(np.zeros_like(DEPTH), True)
-    loss = sparse_point_loss(d, SEEN, 1.0)
-    loss.backward()
-    assert loss.item() == pytest.approx((1 / SEEN[1]).mean().item())
-    assert (d.grad == 0).all()
-    assert sparse_point_loss(d, Seen(tensor(np.zeros((0, 2))), tensor(np.zeros(0))), 1.0).item() == 0
-
-
-def test_back_projected_points_project_onto_their_pixels_with_their_colours() -> None:
-    room = synthetic_recording(cameras=2, frames=1, width=48, height=27)
-    name = next(iter(room.cameras))
-    depth = np.where(room.depth(name, 0) > 0, room.depth(name, 0), 0)
-    points = back_projected(room, name, 0, depth, 100, np.random.default_rng(0))
-    camera = room.cameras[name]
-    local = points.positions @ camera.T_camera_world[:3, :3].T + camera.T_camera_world[:3, 3]
-    pixels = local @ camera.K.T / local[:, 2:]
-    column, row = np.floor(pixels[:, :2]).astype(int).T
-    np.testing.assert_allclose(pixels[:, :2] % 1, 0.5, atol=1e-6)
-    np.testing.assert_allclose(local[:, 2], depth[row, column], rtol=1e-5)
-    np.testing.assert_allclose(points.colors, room.image(name, 0)[row, column] / 255)
 
 
 def tensors_in(state: object) -> list[Tensor]:
@@ -290,16 +248,6 @@ class TestOnARecording:
         mine, others = tensors_in(ours["model"]), tensors_in(theirs["model"])
         assert len(mine) == len(others) > 10
         assert all(torch.equal(a, b) for a, b in zip(mine, others, strict=True))
-
-    def test_a_rivals_run_is_its_own_and_no_run_of_others(self, ablation: Path) -> None:
-        folder, run = folder_of(ablation, "pearson"), run_of(ablation, "pearson")
-        assert run.evaluate(images=False)["guidance"]["name"] == "pearson"
-        with pytest.raises(D2Error, match="pearson.*continue it with the command that began it"):
-            Run.load(folder)
-        stronger = replace(guidance("pearson", 24), config=PearsonConfig(weight=0.5))
-        for other in (guidance("scale_shift", 24), None, stronger):
-            with pytest.raises(D2Error, match="other settings of guidance"):
-                Run(run.settings, folder, other)
 
 
 class TestAtTheirBest:

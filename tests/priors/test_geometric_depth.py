@@ -16,8 +16,6 @@ from d2_plugin.priors.geometry import (
     check_depth_range,
     check_views,
     pixel_grid,
-    scaled_camera,
-    triangulation_angle,
     view_pair,
     viewing_rays,
 )
@@ -247,24 +245,6 @@ def test_a_projection_agrees_with_world_points_and_half_pixel_centres(
     if seen[2] > 1e-3:
         pixel = source.K @ (seen / seen[2]) - 0.5
         assert (at.x[0], at.y[0]) == pytest.approx((pixel[0], pixel[1]), rel=1e-9, abs=1e-6)
-
-
-def test_a_camera_at_another_size_sees_the_same_rays() -> None:
-    view = camera()
-    small = scaled_camera(view, 32, 24)
-    large_rays, small_rays = viewing_rays(view, np.float64), viewing_rays(small, np.float64)
-    averaged = large_rays.reshape(24, 2, 32, 2, 3).mean(axis=(1, 3))
-    np.testing.assert_allclose(small_rays, averaged, atol=1e-12)
-
-
-def test_the_angle_is_that_of_the_triangle_and_zero_for_one_centre() -> None:
-    reference, source = camera(), camera("b", 0.5)
-    depth = np.full((48, 64), 4.0, np.float32)
-    angle = triangulation_angle(reference, view_pair(reference, source), depth)
-    # At the principal point both rays and the baseline make a right-angled triangle.
-    assert angle[24, 30] == pytest.approx(np.arctan2(0.5, 4.0), rel=1e-3)
-    same = triangulation_angle(reference, view_pair(reference, camera("c", 0.0, 0.3)), depth)
-    assert same.max() < 1e-6
 
 
 @pytest.mark.parametrize("bounds", [(5.0, 1.0), (0.0, 1.0), (-1.0, 1.0), (1.0, 1.0), (1.0, np.inf), (np.nan, 2.0)])
