@@ -242,16 +242,11 @@ class Stopped(BaseException):
     """Raised where a test ends the demo."""
 
 
-@pytest.fixture(autouse=True)
-def small(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The demo on a recording of two frames."""
-    tiny = synthetic_recording(cameras=3, held_out=1, frames=2, width=96, height=54)
-    monkeypatch.setattr(demo, "synthetic_recording", lambda: tiny)
-
-
 def test_a_demo_cut_off_while_it_writes_its_recording_goes_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    tiny = synthetic_recording(cameras=3, held_out=1, frames=2, width=96, height=54)
+    monkeypatch.setattr(demo, "synthetic_recording", lambda: tiny)
     command = ["demo", "--output", str(tmp_path / "demo"), "--iterations", "4"]
     write, written = folder_layout.write_png, []
 

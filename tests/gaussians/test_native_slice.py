@@ -29,10 +29,13 @@ from d2_plugin.gaussians.slicing import reference_slice
 OUTPUTS = ("means", "covariances", "opacities")
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture
 def compiled() -> None:
     if kernel.library() is None:
         pytest.skip("there is no C++ compiler")
+
+
+needs_compiler = pytest.mark.usefixtures("compiled")
 
 
 @pytest.fixture(params=[True, False], ids=["temporal", "static"])
@@ -50,6 +53,7 @@ def slice_with_gradients(slice_in, rows: Mapping[str, Tensor], dtype: torch.dtyp
     return (*(o.detach() for o in outputs), drawn), {name: value.grad for name, value in raw.items()}
 
 
+@needs_compiler
 @pytest.mark.parametrize("time_scale", [0.02, 0.5, 2.0])
 @pytest.mark.parametrize("count", [0, 1, 15, 16, 17, 1040, 3001])
 def test_values_and_gradients_are_those_of_torch_in_float64(count: int, time_scale: float, temporal: bool) -> None:
@@ -64,6 +68,7 @@ def test_values_and_gradients_are_those_of_torch_in_float64(count: int, time_sca
         assert relative_error(native_gradients[name], expected) < 1e-5, name
 
 
+@needs_compiler
 def test_where_float32_is_short_of_digits_the_kernel_loses_no_more_than_torch() -> None:
     rows = random_rows(300, True, time_scale=200.0)  # velocities are ratios of numbers three orders apart
     native, native_gradients = slice_with_gradients(native_slice, rows, torch.float32)
@@ -77,6 +82,7 @@ def test_where_float32_is_short_of_digits_the_kernel_loses_no_more_than_torch() 
         assert relative_error(native_gradients[name], expected) < allowed, name
 
 
+@needs_compiler
 def test_the_number_of_threads_changes_no_bit(temporal: bool, same_for_any_threads: Callable) -> None:
     def everything() -> list[Tensor]:
         outputs, gradients = slice_with_gradients(native_slice, random_rows(10_000, temporal), torch.float32)
@@ -85,6 +91,7 @@ def test_the_number_of_threads_changes_no_bit(temporal: bool, same_for_any_threa
     same_for_any_threads(everything)
 
 
+@needs_compiler
 @pytest.mark.parametrize("spoilt", list(TEMPORAL))
 @pytest.mark.parametrize("value", [math.nan, math.inf])
 def test_nan_or_infinity_in_one_gaussian_leaves_the_others_untouched(spoilt: str, value: float) -> None:
@@ -107,6 +114,7 @@ def test_nan_or_infinity_in_one_gaussian_leaves_the_others_untouched(spoilt: str
         assert torch.equal(tensor.grad[others], clean_gradients[name][others]), name
 
 
+@needs_compiler
 def test_each_output_alone_has_its_gradient(temporal: bool) -> None:
     rows = random_rows(40, temporal)
     for output in range(3):
@@ -124,6 +132,7 @@ def test_each_output_alone_has_its_gradient(temporal: bool) -> None:
                 assert relative_error(found, expected) < 5e-6, name
 
 
+@needs_compiler
 def test_rows_of_another_number_of_gaussians_are_refused() -> None:
     rows = random_rows(10, True)
     rows["right"] = rows["right"][:9]
@@ -131,6 +140,7 @@ def test_rows_of_another_number_of_gaussians_are_refused() -> None:
         native_slice(rows, AT, *CONSTANTS)
 
 
+@needs_compiler
 def test_a_model_slices_in_torch_where_there_is_no_compiler(temporal: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     model, view = make_model(temporal=temporal), make_views()[-1]
     native = model.slice_at(view)
