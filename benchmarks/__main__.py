@@ -1,7 +1,5 @@
 """`python -m benchmarks PART ...`: error against run time of one part each; `python -m benchmarks PART --help`."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """`python -m benchmarks align`: error against run time of the fit that aligns monocular to geometric depth."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ of noise, and wrong geometric depths, which are those of other places in the roo
 RANSAC and the median rule of Inria's `make_depth_scale.py` are what other code bases align with.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from dataclasses import dataclass

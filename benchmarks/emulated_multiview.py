@@ -5,8 +5,6 @@ bent a little more by each view for itself, with soft edges, a sky that is inven
 of an arbitrary unit that falls where the map is wrong. The arrays are named as Depth Anything 3 exports them.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

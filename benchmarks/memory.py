@@ -1,7 +1,5 @@
 """Peak memory of a piece of work: resident memory on Linux, measured in a process of its own."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from pathlib import Path

@@ -7,8 +7,6 @@ least 90 % count as calibrated. Of rendered rigs scene flow and what lies betwee
 well. `python -m benchmarks report` draws the reliability diagram of the rows.
 """
 
-from __future__ import annotations
-
 import logging
 import tempfile
 import time

@@ -4,8 +4,6 @@ The room is rendered at four times the rate that the prior is built for, so the 
 each quarter of the way are known exactly.
 """
 
-from __future__ import annotations
-
 import tempfile
 from dataclasses import replace
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """The part of the report about the depth prior: how large it says that its errors are, and how large they are."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 
 from d2_plugin.priors.declared_error import DECLARED, label_name

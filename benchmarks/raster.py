@@ -1,7 +1,5 @@
 """`python -m benchmarks raster`: time against error of the rasterizer, beside its peers, on scenes of known size."""
 
-from __future__ import annotations
-
 import logging
 import re
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """Time, memory and error of one rasterizer on one scene."""
 
-from __future__ import annotations
-
 import importlib.util
 import statistics
 import time

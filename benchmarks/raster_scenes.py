@@ -3,8 +3,6 @@
 Both are seeded and independent of the image size up to the camera, so that times at different sizes compare.
 """
 
-from __future__ import annotations
-
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple

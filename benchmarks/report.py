@@ -3,8 +3,6 @@
 Files of rows (runs.jsonl) and output folders of `d2 train` make one page of plots and tables.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from benchmarks import align, raster, scaling, stereo, training_step

@@ -1,7 +1,5 @@
 """Rows of a benchmark, whose file is looked at before anything is measured."""
 
-from __future__ import annotations
-
 from contextlib import suppress
 from pathlib import Path
 

@@ -4,8 +4,6 @@ The recording is synthetic, written to disk and read back frame by frame as othe
 in processes of their own. Training keeps decoded images up to a bound (320 MiB) and re-reads the others.
 """
 
-from __future__ import annotations
-
 import tempfile
 import time
 from collections.abc import Sequence

@@ -1,8 +1,6 @@
 """`python -m benchmarks stereo`: error against run time of geometric depth, every setting behind the same
 filter."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """What is measured about geometric depth: which settings, and how good their maps are after the common filter."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterable, Sequence
 from statistics import median

@@ -4,8 +4,6 @@ The rendered rooms are textured on most surfaces, with sensor noise of 1 % and e
 ranges come from the truth, a quarter wider on both sides.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property

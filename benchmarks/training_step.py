@@ -6,8 +6,6 @@ Three works run in turn in one process, so that each sees the same machine: the 
 bare step, and a step with the depth loss at every one. Their ratios are what the figures are for.
 """
 
-from __future__ import annotations
-
 import statistics
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

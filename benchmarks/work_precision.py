@@ -4,8 +4,6 @@ After the work-precision diagrams of SciML and the fronts of ann-benchmarks: one
 setting, both axes logarithmic, lower left is better. What another setting beats in both is faded.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple

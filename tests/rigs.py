@@ -22,14 +22,15 @@ NOISE = 0.2
 """Pixels, the standard deviation of a feature's place."""
 
 
-def arc(cameras: int = 4, degrees: float = 25.0) -> dict[str, Camera]:
-    """Cameras on an arc around the origin, `degrees` from one to the next, four units away."""
+def arc(cameras: int = 4, degrees: float = 25.0, scale: float = 1.0) -> dict[str, Camera]:
+    """Cameras on an arc around the origin, `degrees` from one to the next, four units away; 640x480 times `scale`."""
+    width, height = round(640 * scale), round(480 * scale)
     found = {}
     for number in range(cameras):
         angle = np.deg2rad(degrees * (number - (cameras - 1) / 2))
         R = cv2.Rodrigues(np.array([0.0, angle, 0]))[0] @ cv2.Rodrigues(np.array([0.05 * number, 0, 0.02]))[0]
-        K = pinhole(600.0, 601.0, 322.0, 238.0)
-        found[f"c{number}"] = Camera(f"c{number}", 640, 480, K, rigid(R, np.array([0, 0, 4.0])))
+        K = pinhole(600.0 * scale, 601.0 * scale, 322.0 * scale, 238.0 * scale)
+        found[f"c{number}"] = Camera(f"c{number}", width, height, K, rigid(R, np.array([0, 0, 4.0])))
     return found
 
 
@@ -93,3 +94,20 @@ def filmed(
         grey = cv2.warpPerspective(drawn, warp, (camera.width, camera.height), flags=cv2.INTER_AREA, borderValue=128)
         images[name] = [np.repeat(grey[..., None], 3, axis=2)]
     return images, board
+
+
+def held(
+    rig: dict[str, Camera], square: float, moments: int, plain: tuple[int, int] | None = None
+) -> tuple[dict[str, list[np.ndarray]], Board]:
+    """Images of a board at some places, in front of grey."""
+    rng = np.random.default_rng(0)
+    found: dict[str, list[np.ndarray]] = {name: [] for name in rig}
+    for _ in range(moments):
+        turn = np.eye(4)
+        turn[:3, :3] = cv2.Rodrigues(rng.uniform(-0.5, 0.5, 3))[0]
+        turn[:3, 3] = rng.uniform(-0.35, 0.35, 3)
+        moved = {name: replace(camera, T_camera_world=camera.T_camera_world @ turn) for name, camera in rig.items()}
+        images, board = filmed(moved, square, plain)
+        for name, taken in images.items():
+            found[name] += taken
+    return found, board

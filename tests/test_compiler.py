@@ -252,23 +252,33 @@ class TestCache:
             pass
 
 
+@pytest.fixture(scope="module")
+def libraries(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    """One for each level; each says which it is."""
+    found = {}
+    for number, level in enumerate(prebuilt.LEVELS):
+        path = tmp_path_factory.mktemp("levels") / level
+        text = f'extern "C" int answer() {{ return {number}; }}\n'
+        subprocess.run(["c++", "-shared", "-fPIC", "-x", "c++", "-", "-o", path], input=text, text=True, check=True)
+        found[level] = path.read_bytes()
+    return found
+
+
 class TestPrebuilt:
     """Kernels that came compiled with a wheel: the right ones for this CPU, whole ones only, no compiler needed."""
 
     @pytest.fixture(autouse=True)
-    def wheel(self, tmp_path: Path, source: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-        """A package with a library for each level; each says which it is."""
+    def wheel(self, tmp_path: Path, source: Path, libraries: dict[str, bytes], monkeypatch: pytest.MonkeyPatch) -> Path:
+        """A package with a library for each level."""
         source.write_text('extern "C" int answer() { return 42; }\n')
         wheel = tmp_path / "compiled"
         wheel.mkdir()
         monkeypatch.setattr(prebuilt, "FOLDER", wheel)
         monkeypatch.setenv("PATH", "")
         checksums = {}
-        for number, level in enumerate(prebuilt.LEVELS):
+        for level, library in libraries.items():
             path = wheel / prebuilt.file_name("answer", level, [source], [], [])
-            text = f'extern "C" int answer() {{ return {number}; }}\n'
-            command = ["/usr/bin/env", "PATH=/usr/local/bin:/usr/bin:/bin", "c++", "-shared", "-fPIC", "-x", "c++", "-"]
-            subprocess.run([*command, "-o", path], input=text, text=True, check=True)
+            path.write_bytes(library)
             checksums[path.name] = hashlib.sha256(path.read_bytes()).hexdigest()
         (wheel / prebuilt.CHECKSUMS).write_text(json.dumps(checksums))
         prebuilt._checksums.cache_clear()

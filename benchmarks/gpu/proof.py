@@ -4,8 +4,6 @@ Each step has a time limit of its own and leaves its output and a row as soon as
 half an hour loses nothing. A step that cannot run here says why in one sentence; what needs no device runs without one.
 """
 
-from __future__ import annotations
-
 import logging
 import os
 import shutil
@@ -103,7 +101,7 @@ def _sanitizer(tool: str) -> Step:
 
 
 def _raster(settings: GpuBench) -> list[str]:
-    sizes = ("--sizes", "640x360", "1920x1080", "--scenes", "synth:50000", "synth:200000", "synth:1000000")
+    sizes = ("--sizes", "640x360,1920x1080", "--scenes", "synth:50000,synth:200000,synth:1000000")
     kind = ("--device", "cuda", "--seconds", "2", "--error-limit", "60000")
     return _part("raster", *kind, *sizes, "--output", str(settings.output / "raster.jsonl"))
 

@@ -4,8 +4,6 @@ nvcc compiles the sources for an architecture; ptxas says registers, spills and 
 binary says how many instructions it has. Rows of this are called "static analysis" and never more.
 """
 
-from __future__ import annotations
-
 import re
 import struct
 import subprocess

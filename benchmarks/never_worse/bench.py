@@ -7,8 +7,6 @@ each is built anew from its own maps, with the same geometric depth. Rows are wr
 command continues where it was stopped. `python -m benchmarks report` draws them.
 """
 
-from __future__ import annotations
-
 import itertools
 import os
 import shutil

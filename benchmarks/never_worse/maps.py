@@ -1,7 +1,5 @@
 """Recordings whose monocular maps are wrong on purpose, each with the images of the one it was made from."""
 
-from __future__ import annotations
-
 import zlib
 from collections.abc import Callable, Sequence
 from pathlib import Path

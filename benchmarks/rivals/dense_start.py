@@ -11,8 +11,6 @@ instants, where GC-4DGS takes the first. Left out: its ordinal, patch and multi-
 depth by `benchmarks/emulated_multiview`: every pixel has a depth, bent slowly, soft at edges, invented in the sky.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

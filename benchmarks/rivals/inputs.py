@@ -1,7 +1,5 @@
 """What rivals read of a depth prior: the same monocular maps and the same stereo that D² was built from."""
 
-from __future__ import annotations
-
 from abc import abstractmethod
 from dataclasses import dataclass, field
 from functools import cached_property

@@ -16,8 +16,6 @@ before black, as published: s has no gradient, so that the soft loss makes the r
 before a learnt background nothing would hold against it. Left out: smoothness and shape penalties, neural colours.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Annotated, Any, Self
 

@@ -10,8 +10,6 @@ weighted by 0.05, and by 0.001 in the last twentieth of training. gsplat has the
 training.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Annotated, Self
 

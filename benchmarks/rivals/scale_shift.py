@@ -10,8 +10,6 @@ where R_k is the residual at every 2^k-th pixel and M_k their number; alpha = 0.
 The weight is MonoSDF's 0.1 (Yu et al., NeurIPS 2022). Maps are brought to 0..1, which is this project's choice.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

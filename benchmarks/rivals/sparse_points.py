@@ -11,8 +11,6 @@ projects into, unless stereo sees a surface more than 5 % in front of it. Of sev
 count.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import NamedTuple
 

@@ -4,8 +4,6 @@ Sweep on cameras that no reported row trains: studio@01+03+04+06@00+02+05+07 whe
 studio@00+02+05+07@01+03+04+06. The best change of a rival is that with the highest mean PSNR over the recordings.
 """
 
-from __future__ import annotations
-
 import itertools
 import os
 from collections.abc import Iterator, Sequence

@@ -5,8 +5,6 @@ and schedule and once with those that were best in `python -m benchmarks rivals-
 training` has it.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace

@@ -1,7 +1,5 @@
 """What a sweep is: one parameter, how far it is driven, what is measured, and what guards it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -3,8 +3,6 @@
 The fit always computes in float64; what is swept in float32 is the precision in which the maps are given.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 

@@ -5,8 +5,6 @@ A point is `ok` where its error is below the sweep's limit, a `gap` where it is 
 something is not finite or is refused. Nothing is clamped in silence: each sweep names what is guarded, and how.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ iterations on recordings that `d2 export-recording` wrote in its layout, and is 
 cameras. A run without hooks has to end with the bare run's numbers, bit for bit. What is absent is left out by name.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Iterator
 from dataclasses import dataclass

@@ -8,8 +8,6 @@ of held-out cameras; for them it prints one line, of images that their own code 
 that a repository's own metric compares, what moves is scored as well, see `benchmarks.trainers.moving`.
 """
 
-from __future__ import annotations
-
 import hashlib
 import logging
 import random

@@ -5,8 +5,6 @@ held-out view counts at the pixels that differ from the median of its camera's f
 (`d2_plugin.runs.evaluation`), but of all frames of the recording, since a trial has few. The last comparison counts.
 """
 
-from __future__ import annotations
-
 import importlib
 from collections.abc import Callable, Sequence
 from functools import wraps

@@ -1,7 +1,5 @@
 """The tables of docs/results/attach.md, from the rows of `python -m benchmarks trainers`."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from statistics import mean, stdev

@@ -1,7 +1,5 @@
 """Exports and priors that the trials share: made once in the working folder, used again by every run."""
 
-from __future__ import annotations
-
 import logging
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """One run of one official trainer in a process of its own, and the row that it leaves."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

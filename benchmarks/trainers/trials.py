@@ -4,8 +4,6 @@ Nothing of a repository is copied here: these are the names of its options, with
 A schedule that counts iterations is shortened in proportion, so that densification takes place within the run.
 """
 
-from __future__ import annotations
-
 import re
 import socket
 from collections.abc import Callable

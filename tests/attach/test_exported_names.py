@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from stand_in_recordings import smooth_recording
+from tiny import TinyStore
 
 from d2_plugin.adapters.inria import InriaAdapter, RenderedCamera
 from d2_plugin.errors import D2Error
@@ -19,7 +20,7 @@ from d2_plugin.priors.fuse import FusedPrior
 from d2_plugin.protocol import EXPORT_FILE
 from d2_plugin.recordings.export.export import export_recording
 from d2_plugin.recordings.export.ply import PointCloud
-from d2_plugin.store.exported import export_read, opened, renamed_by
+from d2_plugin.store.exported import RenamedStore, export_read, opened, renamed_by
 from d2_plugin.store.store import PriorStore
 
 
@@ -95,6 +96,11 @@ def test_a_camera_of_the_recording_without_a_prior_has_none(exported, tmp_path: 
     PriorStore.create(tmp_path / "part", some, exported.recording.frames, about)
     renamed = opened(str(tmp_path / "part"), str(exported.folder))
     assert renamed.prior("cam00", 0) is None
+
+
+def test_a_folder_without_export_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(D2Error, match="give the folder that `d2 export-recording` wrote"):
+        RenamedStore.of_export(TinyStore(), tmp_path)
 
 
 def test_adapters_say_the_image_of_a_camera() -> None:

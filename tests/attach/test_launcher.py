@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import subprocess
 import sys
@@ -27,7 +26,6 @@ from d2_plugin.attach.recipes import RECIPES, recipe
 from d2_plugin.attach.session import AddGradient, Original, Session
 from d2_plugin.config import DensifyConfig, DepthLossConfig, PruneConfig
 from d2_plugin.hooks.reports import Report, RunLog
-from d2_plugin.store.exported import RenamedStore
 
 DEPTH_LOSS = D2Config(depth_loss=DepthLossConfig(start=2))
 EDITS = D2Config(
@@ -171,22 +169,6 @@ def test_a_script_of_another_repository_is_refused(tmp_path: Path, monkeypatch: 
     monkeypatch.syspath_prepend(str(tmp_path))
     with pytest.raises(D2Error, match="the script's folder has no scene.Scene .* give the repository that the script"):
         Session(recipe("fudan"), DEPTH_LOSS, TinyStore()).wrap()
-
-
-class TestNames:
-    def test_priors_are_found_under_the_names_of_an_export(self, tmp_path: Path) -> None:
-        described = {"cameras": {"cam0": "cam01"}, "frames": {"0": 1, "1": 2}}
-        (tmp_path / "export.json").write_text(json.dumps(described))
-        store = RenamedStore.of_export(TinyStore(), tmp_path)
-        assert torch.equal(store.prior("cam01", 2).depth, TinyStore().prior("cam0", 1).depth)
-        assert store.prior("cam01", 9) is None
-        with pytest.raises(D2Error, match="unknown camera of the export 'cam0': have cam01; did you mean 'cam01'"):
-            store.prior("cam0", 1)
-        assert store.camera("cam01", 2) is None  # TinyStore does not say
-
-    def test_a_folder_without_export_is_refused(self, tmp_path: Path) -> None:
-        with pytest.raises(D2Error, match="give the folder that `d2 export-recording` wrote"):
-            RenamedStore.of_export(TinyStore(), tmp_path)
 
 
 STAND_IN = "d2_plugin.compat.nearest"

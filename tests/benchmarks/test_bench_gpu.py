@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import struct
-from pathlib import Path
 
 import pytest
-import torch
 
+from benchmarks.__main__ import PARTS
 from benchmarks.gpu import proof as gpu
 from benchmarks.gpu import static as gpu_static
 from d2_plugin.errors import D2Error
-from d2_plugin.runs.rows import read_rows
 
 PTXAS = """ptxas info    : Compiling entry function 'd2_render' for 'sm_90'
 ptxas info    : Function properties for d2_render
@@ -27,20 +25,13 @@ def test_all_steps_together_end_in_time() -> None:
     assert sum(step.limit for step in gpu.STEPS.values()) <= gpu.LONGEST
 
 
-def test_what_cannot_run_here_says_why_and_leaves_its_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    told = gpu.run(gpu.GpuBench(steps=("raster", "train-cuda"), output=tmp_path))
-    rows = read_rows([tmp_path / "gpu.jsonl"])
-    assert [row["case"] for row in rows] == ["raster", "train-cuda"]
-    assert all(row["failed"] and row["failed"] in told for row in rows)
-
-
-def test_a_step_ends_at_its_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    step = gpu.Step(1, (), lambda settings: ["sh", "-c", "echo begun; sleep 60"])
-    monkeypatch.setitem(gpu.STEPS, "shim", step)
-    told = gpu.run(gpu.GpuBench(steps=("shim",), output=tmp_path))
-    assert "longer than 1 s" in told
-    assert (tmp_path / "shim.log").read_text() == "begun\n"
+@pytest.mark.parametrize("name", ["raster", "stereo-cuda", "profile"])
+def test_a_step_calls_a_part_with_words_that_the_part_takes(name: str) -> None:
+    words = gpu.STEPS[name].words
+    assert words is not None
+    called = words(gpu.GpuBench())
+    part, *given = called[called.index("benchmarks") + 1 :]
+    PARTS[part].form(part).parse(given)
 
 
 def test_registers_spills_and_shared_memory_are_read_off_what_ptxas_says() -> None:

@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-import shutil
 import xml.etree.ElementTree as ET
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from benchmarks.never_worse.maps import SPOILED, Spoiled, spoiled_recording
-from benchmarks.priors import Case, PriorsBench, cases, rows_of, run
+from benchmarks.priors import PriorsBench, cases, run
 from benchmarks.priors_section import DIAGONAL, priors
-from benchmarks.stereo import tables
-from benchmarks.stereo_measure import VARIANTS, measure, score
+from benchmarks.stereo_measure import score
 from benchmarks.stereo_rigs import Rig, textured_rig
-from d2_plugin.errors import D2Error
-from d2_plugin.priors.declared_error import NORMAL_SHARE, DeclaredErrors, frames_with_truth, reliability_curve
+from d2_plugin.priors.declared_error import NORMAL_SHARE, frames_with_truth, reliability_curve
 from d2_plugin.priors.settings import PriorSettings
 from d2_plugin.recordings import open_recording
 from d2_plugin.recordings.export.folder import save_recording
@@ -51,27 +47,6 @@ def test_the_truth_itself_scores_full_marks_where_views_overlap(rig: Rig) -> Non
     found = score(rig.truths, rig.truths, rig.covisible)
     assert found.completeness == found.f1 == 1
     assert 0.6 < np.mean(rig.covisible) < 0.95
-
-
-def test_covisibility_without_the_other_truth_is_nearly_that_with_it(rig: Rig) -> None:
-    alone = replace(rig, truths=[rig.truths[0], None])
-    assert (alone.covisible[0] == rig.covisible[0]).mean() > 0.97
-    assert not alone.covisible[1].any()
-
-
-def test_a_setting_that_fails_on_a_rig_says_why_and_counts_as_nothing(
-    rig: Rig, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def refuses(*_: object) -> list:
-        raise D2Error("disparities span more than the image")
-
-    working = measure("2 sources", VARIANTS["2 sources"], [rig])
-    monkeypatch.setattr("benchmarks.stereo_measure.patchmatch", refuses)
-    row = measure("2 sources", VARIANTS["2 sources"], [rig])
-    assert row["failed"] == "disparities span more than the image"
-    (_, means), (_, every) = tables([row, working])
-    assert every.rows[0][:6] == ("synthetic2", "2", "192x108", "patchmatch", "2 sources", "failed")
-    assert means.rows[0][:3] == ("patchmatch", "2 sources", f"{working['completeness'] / 2:.3f}")
 
 
 @pytest.fixture(scope="module")
@@ -131,19 +106,6 @@ def test_a_rendered_rig_is_measured_without_any_data(measured: tuple[str, list[R
     assert rows[0]["command"] == line, "no folder of this machine"
 
 
-def test_what_cannot_be_compared_is_refused_in_a_sentence(folder: Path, tmp_path: Path) -> None:
-    blind = shutil.copytree(folder, tmp_path / "blind")
-    shutil.rmtree(blind / "depth")
-    with pytest.raises(D2Error, match=r"^blind has no true depth, .*: name recordings that have one$"):
-        cases(PriorsBench((str(blind),)))
-    with pytest.raises(D2Error, match="den has no true depth at frame 1: choose --frames from frames 0, 2"):
-        cases(PriorsBench((str(folder),), frames=(1,)))
-    with pytest.raises(D2Error, match="unknown camera 'train9'"):
-        cases(PriorsBench((str(folder),), train_cameras=("train9",)))
-    with pytest.raises(D2Error, match="unknown rig 'synthetc2'.*did you mean 'synthetic2'"):
-        cases(PriorsBench(rigs=("synthetc2",)))
-
-
 def test_frames_with_truth_are_those_of_any_of_the_cameras(folder: Path) -> None:
     recording = cases(PriorsBench((str(folder),)))[0].recording
     assert frames_with_truth(recording, ["train0"]) == [0, 2]
@@ -169,16 +131,6 @@ def test_the_diagram_has_a_mark_per_bin_and_the_diagonal(measured: tuple[str, li
     assert "What moves: scene flow, and what lies between two instants" in text
 
 
-def test_a_recording_without_any_label_has_a_row_and_no_curve() -> None:
-    recording = synthetic_recording(1, held_out=0, frames=1, width=32, height=18)
-    rows = rows_of(Case("sky, 1 views", recording, ("train0",)), DeclaredErrors(1, {}, 0.9, 0.01), 1.0)
-    assert [(row["method"], row["error"]) for row in rows] == [("far", 0.01)]
-    section = priors(rows)
-    assert "nothing was measured" in section.figures["priors"]
-    assert [title for title, _ in section.tables] == ["Far pixels"], "every recording has a row, also without labels"
-    assert section.tables[0][1].rows == (("sky, 1 views", "90.0%", "1.0%"),)
-
-
 @pytest.fixture(scope="module")
 def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
     recording = synthetic_recording(2, held_out=1, frames=2, width=96, height=54, arc_degrees=15)
@@ -199,19 +151,3 @@ def test_a_spoiled_recording_differs_in_its_maps_alone(room: Path, tmp_path: Pat
             assert np.array_equal(after.depth(camera, frame), before.depth(camera, frame))
             assert not np.array_equal(after.mono(camera, frame), before.mono(camera, frame))
     assert after.mono(list(before.cameras)[2], before.frames[0]) is None, "a camera that does not train needs no map"
-
-
-def test_each_map_is_what_its_name_says(room: Path, tmp_path: Path) -> None:
-    before = open_recording(room)
-    cameras = list(before.cameras)[:2]
-
-    def spoiled(kind: Spoiled, frames: tuple[int, ...] | None = None, folder: str = "all") -> np.ndarray:
-        path = spoiled_recording(room, cameras, frames, kind, tmp_path / folder, PriorSettings())
-        return open_recording(path).mono(cameras[0], 0)
-
-    assert np.ptp(spoiled("constant")) == 0
-    assert np.std(np.diff(spoiled("noise", folder="noise"))) > 2 * np.std(np.diff(spoiled("smooth", folder="smooth")))
-    other = spoiled("other", folder="other")
-    assert np.allclose(other, before.mono(cameras[0], before.frames[1]), atol=1e-2)
-    alone = spoiled("other", (0,), "one frame")
-    assert np.allclose(alone, before.mono(cameras[1], 0), atol=1e-2), "with one frame it is another camera's"

@@ -35,19 +35,6 @@ def test_parts_are_found_from_any_folder_and_a_mistake_is_one_sentence(
     assert "WIDTHxHEIGHT" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("part", ["align", "raster", "scaling", "stability", "stereo", "training-step"])
-def test_a_place_for_rows_that_cannot_be_is_said_before_anything_is_measured(
-    part: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("torch.set_num_threads", lambda count: None)
-    monkeypatch.setattr("benchmarks.stereo._set_threads", lambda count: None)
-    (tmp_path / "thesis.tex").write_text("mine")
-    for name, says in (("thesis.tex", "is no file of rows"), ("thesis.tex/x.jsonl", "is a file"), (".", "is a folder")):
-        assert main([part, "--output", str(tmp_path / name)]) == 2
-        assert says in capsys.readouterr().err
-    assert (tmp_path / "thesis.tex").read_text() == "mine"
-
-
 @pytest.mark.parametrize(
     ("words", "rows", "shown"),
     [

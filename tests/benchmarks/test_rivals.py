@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,14 +13,12 @@ from numpy.lib.stride_tricks import sliding_window_view
 from tiny import BACKBONES, TinyStore, make_adapter, make_model, make_views
 from torch import Tensor
 
-from benchmarks.rivals.dense_start import DenseStartConfig, back_projected
-from benchmarks.rivals.inputs import expected_depth
 from benchmarks.rivals.patch_norm import PatchNorm, PatchNormConfig, hard_and_soft, patch_norm_loss
-from benchmarks.rivals.pearson import PearsonConfig, pearson_depth_loss
+from benchmarks.rivals.pearson import pearson_depth_loss
 from benchmarks.rivals.scale_shift import scale_shift_loss
 from benchmarks.rivals.sparse_points import Seen, sparse_point_loss
 from benchmarks.rivals.sweep import best_change
-from benchmarks.rivals.table import RIVAL_PRESETS, RIVALS, Change, guidance
+from benchmarks.rivals.table import RIVAL_PRESETS, RIVALS, guidance
 from d2_plugin import D2Config, D2Hooks
 from d2_plugin.errors import D2Error
 from d2_plugin.hooks import Context, Hook, HookConfig
@@ -121,16 +118,6 @@ def test_gradients_are_those_of_the_loss(name: str) -> None:
     torch.autograd.gradcheck(loss, tensor(at, True))
 
 
-def test_the_global_deviation_of_patch_norm_has_no_gradient() -> None:
-    """Scaling the render changes the loss through the centred values alone: the divisor is held."""
-    d, x, fixed = tensor(DEPTH, True), tensor(DEPTH, True), DEPTH.std(ddof=1)
-    patch_norm_loss(d, tensor(-MONO), 5, 0.0, True).backward()
-    cut = torch.stack([x[i : i + 5, j : j + 5].flatten() for i in range(0, 20, 5) for j in range(0, 30, 5)])
-    mine = (cut - cut.mean(1, keepdim=True)) / (fixed + 0.01 * cut.std())
-    (mine - tensor(normalised(-MONO, True))).square().mean().backward()
-    torch.testing.assert_close(d.grad, x.grad, rtol=1e-9, atol=1e-12)
-
-
 DEGENERATE: dict[str, tuple[Callable[[Tensor], Tensor], np.ndarray, float | None]] = {
     "pearson, flat render": (lambda d: pearson_depth_loss(d, tensor(MONO).to(d)), FLAT, 1),
     "pearson, flat map": (lambda d: pearson_depth_loss(d, tensor(FLAT).to(d)), DEPTH, 1),
@@ -152,19 +139,6 @@ def test_where_nothing_can_be_told_there_is_no_gradient(name: str, dtype: torch.
     found.backward()
     assert value is None or found.item() == pytest.approx(value, abs=1e-6)
     assert (d.grad == 0).all()
-
-
-@pytest.mark.parametrize("whole", [True, False])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("depth", [FLAT, np.zeros_like(FLAT), FLAT[:3, :3], FLAT[:1, :1]])
-def test_patch_norm_of_constant_and_tiny_maps_has_finite_gradients(
-    depth: np.ndarray, dtype: torch.dtype, whole: bool
-) -> None:
-    d = tensor(depth).to(dtype).requires_grad_()
-    loss = patch_norm_loss(d, tensor(-MONO[: depth.shape[0], : depth.shape[1]]).to(dtype), 5, 0.0, whole)
-    loss.backward()
-    assert loss.isfinite()
-    assert d.grad.isfinite().all()
 
 
 class OneMap:
@@ -205,45 +179,6 @@ def test_hard_depth_draws_what_ends_fainter(backbone: str) -> None:
     assert torch.equal(hard.means, splats.means)
 
 
-def test_pixels_without_a_map_do_not_count() -> None:
-    d = tensor(DEPTH, True)
-    pearson_depth_loss(d, tensor(np.where(MASK, MONO, np.nan))).backward()
-    assert (d.grad[~tensor(MASK)] == 0).all()
-    assert torch.isfinite(d.grad).all()
-
-
-def test_no_depth_counts_as_infinitely_far_and_no_point_as_nothing() -> None:
-    d = tensor(np.zeros_like(DEPTH), True)
-    loss = sparse_point_loss(d, SEEN, 1.0)
-    loss.backward()
-    assert loss.item() == pytest.approx((1 / SEEN[1]).mean().item())
-    assert (d.grad == 0).all()
-    assert sparse_point_loss(d, Seen(tensor(np.zeros((0, 2))), tensor(np.zeros(0))), 1.0).item() == 0
-
-
-def test_expected_depth_is_zero_without_gradient_where_little_is_drawn() -> None:
-    alpha = torch.tensor([0.0, 0.4, 0.8], dtype=torch.float64, requires_grad=True)
-    depth, valid = expected_depth(torch.tensor([0.0, 1.0, 2.0], dtype=torch.float64), alpha)
-    assert depth.tolist() == [0, 0, 2.5]
-    assert valid.tolist() == [False, False, True]
-    depth.sum().backward()
-    assert alpha.grad.tolist()[:2] == [0, 0]
-
-
-def test_back_projected_points_project_onto_their_pixels_with_their_colours() -> None:
-    room = synthetic_recording(cameras=2, frames=1, width=48, height=27)
-    name = next(iter(room.cameras))
-    depth = np.where(room.depth(name, 0) > 0, room.depth(name, 0), 0)
-    points = back_projected(room, name, 0, depth, 100, np.random.default_rng(0))
-    camera = room.cameras[name]
-    local = points.positions @ camera.T_camera_world[:3, :3].T + camera.T_camera_world[:3, 3]
-    pixels = local @ camera.K.T / local[:, 2:]
-    column, row = np.floor(pixels[:, :2]).astype(int).T
-    np.testing.assert_allclose(pixels[:, :2] % 1, 0.5, atol=1e-6)
-    np.testing.assert_allclose(local[:, 2], depth[row, column], rtol=1e-5)
-    np.testing.assert_allclose(points.colors, room.image(name, 0)[row, column] / 255)
-
-
 def tensors_in(state: object) -> list[Tensor]:
     """All tensors of a nested state, in its order."""
     if isinstance(state, Tensor):
@@ -254,7 +189,7 @@ def tensors_in(state: object) -> list[Tensor]:
 
 @pytest.fixture(scope="module")
 def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    recording = synthetic_recording(cameras=3, held_out=1, frames=2, width=96, height=54)
+    recording = synthetic_recording(cameras=2, held_out=1, frames=2, width=96, height=54)
     return save_recording(recording, tmp_path_factory.mktemp("recordings") / "room")
 
 
@@ -263,7 +198,7 @@ def ablation(room: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     pytest.importorskip("pycolmap", reason="pycolmap is in the `stereo` extra")
     pytest.importorskip("cv2", reason="opencv is in the `image` extra")
     output = tmp_path_factory.mktemp("ablation") / "out"
-    base = RunSettings(str(room), ("train0", "train1", "train2"), iterations=24)
+    base = RunSettings(str(room), ("train0", "train1"), iterations=24)
     presets = rows_named(["backbone", *RIVALS, "full"], PRESETS | RIVAL_PRESETS)
     ablate(base, presets, ["yang4d"], [0], output, 1, "")
     return output
@@ -290,15 +225,11 @@ class TestOnARecording:
             assert metrics["guidance"]["name"] == name
             assert metrics["cpu_seconds"]["train"] > 0
 
-    def test_rivals_change_the_run_and_the_dense_one_starts_with_more(self, ablation: Path) -> None:
-        scores = {path.parts[-3]: json.loads(path.read_text()) for path in ablation.rglob("metrics.json")}
-        assert len({metrics["test"]["psnr"] for metrics in scores.values()}) == len(scores)
-
     def test_a_dense_start_adds_stereo_points_to_the_triangulated_ones(self, ablation: Path) -> None:
         run = run_of(ablation, "dense_start")
         points = run.prepare()
         started = guidance("dense_start", 24).start(run.scene, points, run.priors)
-        assert len(points) + 300 < len(started) <= len(points) + 0.18 * 96 * 54 + 6  # each of six images rounds
+        assert len(points) + 300 < len(started) <= len(points) + 0.18 * 96 * 54 + 6  # each of four images rounds
         np.testing.assert_array_equal(started.positions[: len(points)], points.positions)
         assert set(started.times) == {0.0, run.scene.recording.seconds(1)}
 
@@ -318,26 +249,8 @@ class TestOnARecording:
         assert len(mine) == len(others) > 10
         assert all(torch.equal(a, b) for a, b in zip(mine, others, strict=True))
 
-    def test_a_rivals_run_is_its_own_and_no_run_of_others(self, ablation: Path) -> None:
-        folder, run = folder_of(ablation, "pearson"), run_of(ablation, "pearson")
-        assert run.evaluate(images=False)["guidance"]["name"] == "pearson"
-        with pytest.raises(D2Error, match="pearson.*continue it with the command that began it"):
-            Run.load(folder)
-        stronger = replace(guidance("pearson", 24), config=PearsonConfig(weight=0.5))
-        for other in (guidance("scale_shift", 24), None, stronger):
-            with pytest.raises(D2Error, match="other settings of guidance"):
-                Run(run.settings, folder, other)
-
 
 class TestAtTheirBest:
-    def test_a_change_scales_the_weight_and_ends_the_loss(self) -> None:
-        changed = Change(0.1, 0.5).of(PearsonConfig.for_iterations(400), 400)
-        assert changed.weight == pytest.approx(0.005)
-        assert changed.window.due(200)
-        assert not changed.window.due(201)
-        assert Change(2.0).of(DenseStartConfig(), 400).density == pytest.approx(0.36)
-        assert str(Change(0.1, 0.5)) == "0.1 times, first 50%"
-
     @pytest.mark.parametrize("name", RIVALS)
     def test_the_best_is_that_of_the_sweep(self, name: str) -> None:
         """No weight of a table is chosen by hand."""

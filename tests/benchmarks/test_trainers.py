@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import random
 import sys
 from collections.abc import Callable
 from dataclasses import replace
@@ -15,13 +14,11 @@ import pytest
 import torch
 from mimics.workplace import furnish
 
-from benchmarks.trainers import inside, prepare
 from benchmarks.trainers.bench import TrainersBench, run
 from benchmarks.trainers.moving import Moving
 from benchmarks.trainers.page import read_rows, replaced, table
 from benchmarks.trainers.prepare import Prepared, Source
-from benchmarks.trainers.trials import TRIALS, Job, Trial, gsplat_stats, reported, scored_after
-from d2_plugin import D2Error
+from benchmarks.trainers.trials import TRIALS, Job, Trial
 
 TESTS = Path(__file__).parents[1]
 
@@ -59,16 +56,6 @@ class TestTable:
         assert cells[3:7] == ["21.00", "the same bits", "24.00", "+3.00"]
         assert cells[7:] == ["-", "1000 → 1500", "600 / 100", "- → -", "-0.50 at 50"]
 
-    def test_one_other_bit_without_hooks_is_seen(self) -> None:
-        assert "DIFFERS" in table([ROWS[0], ROWS[1] | {"digest": "c"}, ROWS[2]])
-        assert "DIFFERS" in table([ROWS[0], ROWS[1] | {"psnr": {"50": 20.0, "200": 21.0001}}, ROWS[2]])
-
-    def test_several_seeds_are_a_mean_and_its_standard_error(self) -> None:
-        more = [row("bare", {"200": 22.0}, 1), row("attached", {"200": 26.0}, 1)]
-        text = table([*ROWS, *more])
-        assert "21.50 ± 0.50" in text
-        assert "+3.50 ± 0.50" in text
-
     def test_what_moves_is_compared_where_both_were_scored(self) -> None:
         bare, attached = row("bare", {"200": 21.0}, psnr_moving=18.0), row("attached", {"200": 24.0}, psnr_moving=20.5)
         assert "| 18.00 → 20.50, +2.50 |" in table([bare, attached])
@@ -78,17 +65,6 @@ class TestTable:
         page = TESTS.parent / "docs" / "results" / "attach.md"
         text = page.read_text()
         assert replaced(text, table(read_rows(page.with_suffix("") / "rows.jsonl")), "") == text
-
-    def test_what_did_not_run_is_named_below(self) -> None:
-        text = table([row("bare", {}, failed="ended with code 2: no wheel")])
-        assert text.endswith("- fudan on studio, bare: ended with code 2: no wheel")
-
-    def test_the_page_changes_between_its_marks_alone(self) -> None:
-        assert replaced("a\n<!-- rows -->\nold\n<!-- end -->\nb\n", "new", "page") == (
-            "a\n<!-- rows -->\n\nnew\n\n<!-- end -->\nb\n"
-        )
-        with pytest.raises(D2Error, match="page needs one line <!-- rows -->"):
-            replaced("a", "new", "page")
 
 
 def true_images(folder: Path) -> Path:
@@ -113,18 +89,6 @@ def test_what_moves_is_scored_in_held_out_views_alone_and_the_last_comparison_co
     assert moving.score() == pytest.approx(20.0, abs=1e-3), "the still half is exact and does not count"
 
 
-def test_a_model_that_is_a_module_is_counted_and_told_apart() -> None:
-    """cem-4dgs's, whose motions are not drawn."""
-    model = torch.nn.Module()
-    model._xyz = torch.nn.Parameter(torch.zeros(5, 3))
-    model._xyz_motion = torch.nn.Parameter(torch.zeros(2, 3))
-    model._parent = torch.full((7, 1), -1)
-    before = inside.digest([model])
-    assert inside.count(model) == 5
-    model._xyz.data += 1
-    assert inside.digest([model]) != before
-
-
 class TestTrials:
     @pytest.mark.parametrize("name", TRIALS)
     def test_its_script_is_told_data_length_and_place(self, name: str, tmp_path: Path) -> None:
@@ -135,15 +99,6 @@ class TestTrials:
         assert str(asked.model) in told
         assert "200" in told
         assert not asked.model.exists(), "4C4D refuses a folder that is there"
-
-    def test_scores_are_read_where_each_leaves_them(self, tmp_path: Path) -> None:
-        printed = "x\n[ITER 50] Evaluating test: L1 0.05 PSNR 20.5 [22/11]\n[ITER 50] Evaluating train: L1 0 PSNR 30\n"
-        assert reported(job(tmp_path), printed) == {50: 20.5}
-        assert scored_after(job(tmp_path), "\n[held out] iteration 200: PSNR 19.25\n") == {200: 19.25}
-        stats = tmp_path / "model" / "stats"
-        stats.mkdir(parents=True)
-        (stats / "val_step0199.json").write_text('{"psnr": 18.5, "ssim": 0.5, "lpips": NaN}')
-        assert gsplat_stats(job(tmp_path), "") == {200: 18.5}
 
 
 TRAIN = """
@@ -213,25 +168,6 @@ def test_a_trainer_runs_in_its_own_process_and_leaves_rows_and_a_table(
     assert failed["failed"] == "ended with code 1: no luck"
 
 
-def test_a_script_that_sets_its_own_seed_gets_another(monkeypatch: pytest.MonkeyPatch) -> None:
-    for module, name in ((random, "seed"), (np.random, "seed"), (torch, "manual_seed")):
-        monkeypatch.setattr(module, name, getattr(module, name))
-
-    def drawn() -> list[float]:
-        random.seed(0), np.random.seed(0), torch.manual_seed(0)  # as the trainers' safe_state does
-        return [random.random(), np.random.rand(), torch.rand(()).item()]
-
-    with torch.random.fork_rng():
-        plain = drawn()
-        inside.move_seeds(0)
-        assert drawn() == plain
-        inside.move_seeds(3)
-        moved = drawn()
-        assert all(a != b for a, b in zip(plain, moved, strict=True))
-        assert drawn() == moved
-        np.random.seed([1, 2])  # as the workers of a DataLoader do
-
-
 CHECKOUTS = os.environ.get("D2_CHECKOUTS")
 ITERATIONS = int(os.environ.get("D2_CHECKOUT_ITERATIONS", "60"))
 
@@ -260,23 +196,3 @@ def test_the_official_trainer_bare_without_hooks_and_attached(
     assert (bare["digest"], bare["psnr"]) == (without["digest"], without["psnr"])
     assert bare["digest"] != attached["digest"]
     assert attached["inserted"] > 0
-
-
-def test_exports_are_made_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Frames are a range: a pair of numbers is two frames, and a trainer that is told of three then misses one."""
-    asked = []
-
-    def export(settings: object) -> str:
-        asked.append(settings)
-        settings.output.mkdir(parents=True)
-        return ""
-
-    monkeypatch.setattr(prepare, "export", export)
-    (tmp_path / "priors" / "studio-4-2").mkdir(parents=True)
-    (tmp_path / "priors" / "studio-4-2" / "store.json").touch()
-    (tmp_path / "studio-4-2.npz").touch()
-    source = Source(tmp_path / "studio", 4, 2)
-    first, second = (prepare.prepare(source, TRIALS["hust4d"], tmp_path) for _ in range(2))
-    assert first == second
-    assert [settings.frames for settings in asked] == [(0, 1, 2, 3)] * 2
-    assert [settings.train_cameras[0] for settings in asked] == ["00", "01"]

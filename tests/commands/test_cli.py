@@ -201,15 +201,6 @@ def test_one_instant_leaves_the_temporal_dimension_out(recording: Path, tmp_path
     assert [path.name for path in (tmp_path / "still" / "export" / "ply").iterdir()] == ["frame_00001.ply"]
 
 
-def test_one_training_camera_without_metric_depth_is_refused_or_trains_bare(
-    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert train(recording, tmp_path / "bare", "--hooks", "none", cameras="train0") == 0
-    plan = json.loads((tmp_path / "bare" / "metrics.json").read_text())["plan"]
-    assert plan["stereo"] == {"use": False, "reason": "one training camera"}
-    assert plan["verification"]["use"] is False
-
-
 def test_all_cameras_may_train(recording: Path, tmp_path: Path) -> None:
     assert train(recording, tmp_path / "all", "--hooks", "none", cameras=CAMERAS + ",test0") == 0
     metrics = json.loads((tmp_path / "all" / "metrics.json").read_text())
@@ -251,16 +242,11 @@ class Stopped(BaseException):
     """Raised where a test ends the demo."""
 
 
-@pytest.fixture(autouse=True)
-def small(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The demo on a recording of two frames."""
-    tiny = synthetic_recording(cameras=3, held_out=1, frames=2, width=96, height=54)
-    monkeypatch.setattr(demo, "synthetic_recording", lambda: tiny)
-
-
 def test_a_demo_cut_off_while_it_writes_its_recording_goes_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    tiny = synthetic_recording(cameras=3, held_out=1, frames=2, width=96, height=54)
+    monkeypatch.setattr(demo, "synthetic_recording", lambda: tiny)
     command = ["demo", "--output", str(tmp_path / "demo"), "--iterations", "4"]
     write, written = folder_layout.write_png, []
 

@@ -107,16 +107,6 @@ class TestTables:
         metrics = json.loads((output / "metrics.json").read_text())
         assert metrics["plan"]["temporal"]["use"] is False
 
-    def test_the_same_flags_continue_a_run_and_others_are_refused(
-        self, recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-    ) -> None:
-        words = ["train", str(recording), *CAMERAS, "--iterations", "4", "--hooks", "none", "--output", str(tmp_path)]
-        lists = ["--priors.depth-range", "1,9"]
-        assert main([*words, *lists]) == 0
-        assert main([*words, *lists]) == 0
-        assert main([*words, "--priors.depth-range", "1,8"]) == 2
-        assert "other settings of overrides" in capsys.readouterr().err
-
     def test_the_tables_of_a_backbone_are_those_of_the_chosen_one(self, capsys: pytest.CaptureFixture[str]) -> None:
         words = ["room", *CAMERAS, "--output", "x"]
         assert parsed("train", *words, "--backbone", "deform", "--backbone.field", "hexplane").tables == {

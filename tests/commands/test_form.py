@@ -163,22 +163,6 @@ class TestHelp:
         assert "--no-images Less. --" not in text
         assert "--output PATH Where it goes. (needed)" in text
 
-    def test_tables_stand_with_a_line_each_and_open_on_demand(self) -> None:
-        form = form_of()
-        short = help_text(form, ["--help"])
-        assert "--prune.edges.*" in short
-        assert "--prune.edges.width" not in short
-        table = " ".join(help_text(form, ["--help", "prune.edges"]).split())
-        assert "[prune.edges] How edges are found." in table
-        assert (
-            "--prune.edges.width N Of the window. Studio: 28.9 dB at 3, 28.1 at 5. (pixels, at least 1; default 3)"
-            in table
-        )
-        assert "--prune.every" not in table
-        assert "--prune.edges.width" in help_text(form, ["--help", "prune"])
-        whole = help_text(form, ["--help-all"])
-        assert all(flag in whole for flag in ("--steps", "--prune.every", "--prune.edges.scales"))
-
     def test_an_unknown_table_is_answered_with_the_nearest(self) -> None:
         with pytest.raises(D2Error, match="did you mean 'prune'"):
             help_text(form_of(), ["--help", "prunes"])

@@ -178,19 +178,6 @@ def test_the_hook_adds_the_weighted_mean_of_a_batch(count: int) -> None:
             torch.testing.assert_close(one, 0.7 / count * other)
 
 
-class TestMemory:
-    def test_priors_stay_in_memory_as_long_as_they_fit(self) -> None:
-        prior, reads = prior_of(0, 360, 640), []
-        store = SimpleNamespace(prior=lambda camera, frame: reads.append(frame) or prior)
-        views = [View("a", frame, 0.0, torch.eye(4), torch.eye(3), 640, 360) for frame in range(8)]
-        for memory, expected in ((32, 8), (16, 16)):  # a view takes 3.2 MB
-            reads.clear()
-            loader = PriorLoader(store, memory)
-            for view in (*views, *views):
-                assert loader.known(view).near > 0
-            assert len(reads) == expected
-
-
 CONFIG = DepthLossConfig(tau_v=0.5, epsilon=0.01, sigma_full=0.05, opaque=0)
 
 SHAPE = (7, 9)

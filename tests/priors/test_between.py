@@ -135,10 +135,6 @@ class TestFlights:
         assert common_acceleration(self.flights(2)) is None
         assert common_acceleration([]) is None
 
-    def test_halfway_it_is_on_the_parabola(self) -> None:
-        for flight in self.flights():
-            np.testing.assert_allclose(flight.bend(FALL), -FALL / 8, atol=1e-12)
-
     @pytest.mark.parametrize("impact", [0.25, 0.4, 0.6, 0.75])
     def test_where_it_hits_something_it_has_turned_by_then_or_not(self, impact: float) -> None:
         """It falls with 1, and goes up again with 1, `impact` of an interval after the start."""

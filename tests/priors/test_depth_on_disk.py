@@ -478,12 +478,6 @@ def test_distances_along_the_ray_become_planar_depth_once(one_sensor: Recording)
     np.testing.assert_allclose(prior_of(one_sensor).prior(ONE, 0).depth, before, rtol=1e-3)
 
 
-def test_an_unknown_direction_is_refused(one_sensor: Recording) -> None:
-    write_map(one_sensor, one_sensor.depth(ONE, 0), {"scale": 1.0, "along": "rays"})
-    with pytest.raises(D2Error, match=r"unknown along in .*depth.json 'rays'.*ray"):
-        prior_of(one_sensor)
-
-
 def test_metric_maps_may_measure_along_the_ray_and_relative_ones_may_not(tmp_path: Path) -> None:
     room = synthetic_recording(cameras=1, held_out=0, frames=1, width=96, height=54)
     truth, camera = room.depth(ONE, 0), room.cameras[ONE]

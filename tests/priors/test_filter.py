@@ -262,16 +262,6 @@ def test_where_anything_is_unknown_sigma_is_infinite_and_never_nan() -> None:
     assert sigma.dtype == np.float32
 
 
-def test_the_gradient_is_that_of_the_grey_value_whatever_its_direction() -> None:
-    rows, columns = np.mgrid[:40, :60]
-    ramp = (20 + 2 * columns + rows).astype(np.uint8)
-    inside = np.s_[8:-8, 8:-8]
-    expected = np.hypot(2, 1) / 255
-    np.testing.assert_allclose(grey_gradient(ramp)[inside], expected, rtol=0.02)
-    np.testing.assert_allclose(grey_gradient(np.ascontiguousarray(ramp.T)).T[inside], expected, rtol=0.02)
-    assert grey_gradient(np.full((9, 9), 7, np.uint8)).max() < 1e-6
-
-
 def test_a_flat_part_beside_a_textured_one_has_a_gradient() -> None:
     image = np.zeros((180, 320), np.uint8)
     image[:, :107] = np.random.default_rng(2).integers(0, 255, (180, 107))

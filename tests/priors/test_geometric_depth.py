@@ -16,8 +16,6 @@ from d2_plugin.priors.geometry import (
     check_depth_range,
     check_views,
     pixel_grid,
-    scaled_camera,
-    triangulation_angle,
     view_pair,
     viewing_rays,
 )
@@ -247,36 +245,6 @@ def test_a_projection_agrees_with_world_points_and_half_pixel_centres(
     if seen[2] > 1e-3:
         pixel = source.K @ (seen / seen[2]) - 0.5
         assert (at.x[0], at.y[0]) == pytest.approx((pixel[0], pixel[1]), rel=1e-9, abs=1e-6)
-
-
-def test_true_depth_of_one_view_lands_on_true_depth_of_the_other() -> None:
-    recording = synthetic_recording(cameras=2, frames=1, width=96, height=54)
-    first, second = (recording.cameras[name] for name in ("train0", "train1"))
-    depth, other = recording.depth("train0", 0), recording.depth("train1", 0)
-    at = view_pair(first, second).project(*pixel_grid(first), depth)
-    inside = (at.x >= 0) & (at.y >= 0) & (at.x <= 95) & (at.y <= 53) & (at.z > 0)
-    there = other[np.rint(at.y[inside]).astype(int), np.rint(at.x[inside]).astype(int)]
-    agree = np.abs(there - at.z[inside]) < 0.02 * at.z[inside]
-    assert agree.mean() > 0.7  # the rest is hidden from the other view
-    assert np.median(np.abs(there - at.z[inside])[agree] / at.z[inside][agree]) < 0.005
-
-
-def test_a_camera_at_another_size_sees_the_same_rays() -> None:
-    view = camera()
-    small = scaled_camera(view, 32, 24)
-    large_rays, small_rays = viewing_rays(view, np.float64), viewing_rays(small, np.float64)
-    averaged = large_rays.reshape(24, 2, 32, 2, 3).mean(axis=(1, 3))
-    np.testing.assert_allclose(small_rays, averaged, atol=1e-12)
-
-
-def test_the_angle_is_that_of_the_triangle_and_zero_for_one_centre() -> None:
-    reference, source = camera(), camera("b", 0.5)
-    depth = np.full((48, 64), 4.0, np.float32)
-    angle = triangulation_angle(reference, view_pair(reference, source), depth)
-    # At the principal point both rays and the baseline make a right-angled triangle.
-    assert angle[24, 30] == pytest.approx(np.arctan2(0.5, 4.0), rel=1e-3)
-    same = triangulation_angle(reference, view_pair(reference, camera("c", 0.0, 0.3)), depth)
-    assert same.max() < 1e-6
 
 
 @pytest.mark.parametrize("bounds", [(5.0, 1.0), (0.0, 1.0), (-1.0, 1.0), (1.0, 1.0), (1.0, np.inf), (np.nan, 2.0)])

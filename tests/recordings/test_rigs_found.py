@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from recorded import Filmed, Shooting, video
-from rigs import arc, cv2, filmed, seen_by, worst
+from rigs import arc, cv2, filmed, held, seen_by, worst
 from stand_in_recordings import smooth_recording
 
 from d2_plugin.commands.cli import main
@@ -59,28 +59,11 @@ class TestFocalLengths:
             solve_features(seen_by(truth, things=60), blind(truth), tuple(truth), focal="each")
 
 
-def held(
-    rig: dict[str, Camera], square: float, moments: int, plain: tuple[int, int] | None = None
-) -> tuple[dict[str, list[np.ndarray]], Board]:
-    """Images of a board at some places, in front of grey."""
-    rng = np.random.default_rng(0)
-    found: dict[str, list[np.ndarray]] = {name: [] for name in rig}
-    for _ in range(moments):
-        turn = np.eye(4)
-        turn[:3, :3] = cv2.Rodrigues(rng.uniform(-0.5, 0.5, 3))[0]
-        turn[:3, 3] = rng.uniform(-0.35, 0.35, 3)
-        moved = {name: replace(camera, T_camera_world=camera.T_camera_world @ turn) for name, camera in rig.items()}
-        images, board = filmed(moved, square, plain)
-        for name, taken in images.items():
-            found[name] += taken
-    return found, board
-
-
 class TestBoards:
     """Corners are matches, however little else two cameras share."""
 
     def test_a_board_alone_settles_cameras_forty_degrees_apart(self) -> None:
-        truth = arc(3, 40.0)
+        truth = arc(3, 40.0, 0.75)
         images, board = held(truth, 0.2, 4)
         rig = solve_rig(images, truth, board=board)
         degrees, share = worst(rig.cameras, truth)
@@ -100,10 +83,10 @@ class TestBoards:
 
     @pytest.mark.parametrize("size", [(8, 6), (8, 5)])
     def test_a_plain_board_that_some_see_the_other_way_up_settles_the_rig_and_its_scale(self, size) -> None:
-        truth = arc(3, 40.0)
+        truth = arc(3, 40.0, 0.5)
         images, board = held(truth, 0.2, 6, plain=size)
         images["c1"] = [np.ascontiguousarray(image[::-1, ::-1]) for image in images["c1"]]  # hung upside down
-        K = truth["c1"].K * [[1, 1, -1], [1, 1, -1], [1, 1, 1]] + [[0, 0, 640], [0, 0, 480], [0, 0, 0]]
+        K = truth["c1"].K * [[1, 1, -1], [1, 1, -1], [1, 1, 1]] + [[0, 0, 320], [0, 0, 240], [0, 0, 0]]
         over = np.diag([-1.0, -1, 1, 1])
         truth["c1"] = replace(truth["c1"], K=K, T_camera_world=over @ truth["c1"].T_camera_world)
         rig = solve_rig(images, truth, board=board)

@@ -52,6 +52,7 @@ def test_what_a_scene_does_not_have_is_left_out(moving, frames, cameras, maps, u
     assert all(plan.uses(name) for name in used)
     assert not any(plan.uses(name) for name in left_out)
     assert frames is None or plan.as_dict()["temporal"] == {"use": False, "reason": "one instant"}
+    assert len(cameras) > 1 or plan.as_dict()["stereo"] == {"use": False, "reason": "one training camera"}
 
 
 def test_no_motion_leaves_the_temporal_dimension_out() -> None:
