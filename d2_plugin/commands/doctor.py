@@ -22,6 +22,7 @@ OPTIONAL = {
     "onnxruntime": ("mono", "monocular depth from an ONNX network"),
     "pycolmap": ("stereo", "sparse points from known cameras"),
     "cv2": ("image", "images, videos, building priors"),
+    "kornia": ("test", "image operations that tests compare with"),
     "av": ("video", "the import of videos, and videos of a run"),
     "viser": ("view", "the page that shows a run, and one that trains"),
     "fourdgs": ("formats", "exports as .4dgs"),
