@@ -9,7 +9,7 @@ are refused here already, not after the training that they are to score.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations
 from typing import NamedTuple
@@ -19,7 +19,7 @@ import numpy as np
 from d2_plugin.errors import D2Error
 from d2_plugin.recordings.cameras.calibrating.features import Features, find_features, match_all
 from d2_plugin.recordings.cameras.camera import field_of_view
-from d2_plugin.recordings.cameras.epipolar import epipolar_lines, homogeneous
+from d2_plugin.recordings.cameras.epipolar import sampson
 from d2_plugin.recordings.images import opencv
 from d2_plugin.recordings.recording import Camera, Recording
 from d2_plugin.recordings.selection import spread
@@ -67,8 +67,9 @@ def check_recording(recording: Recording, cameras: Sequence[str], scored: Sequen
         for frame in _frames(recording, len(scored)):
             recording.depth(name, frame)
     masks = _empty_masks(recording, cameras, _frames(recording, len(cameras)))
-    seen = (*_views(rig), *_origin(rig), *_alone(rig), *_plain(recording, cameras))
-    return (*seen, *masks, *_contradicted(recording, cameras))
+    seen = (*_views(rig), *_origin(rig), *_alone(rig), *_plain(recording, cameras), *masks)
+    said = _missed(_checked(recording, _features(recording, cameras)))
+    return (*seen, said) if said else seen
 
 
 def check_background_weight(recording: Recording, cameras: Sequence[str], weight: float) -> None:
@@ -143,7 +144,7 @@ def _plain(recording: Recording, cameras: Sequence[str]) -> Iterator[str]:
         blank: dict[str, list[int]] = {}
         for frame in _frames(recording, len(cameras)):
             image = recording.image(name, frame)
-            if all(_range(part).max() <= ONE_COLOUR for part in (image[::SPARSE, ::SPARSE], image)):
+            if all(np.ptp(part, axis=(0, 1)).max() <= ONE_COLOUR for part in (image[::SPARSE, ::SPARSE], image)):
                 blank.setdefault("black" if image.max() <= ONE_COLOUR else "of one colour", []).append(frame)
         for what, frames in blank.items():
             yield f"camera {name} is {what} at frame {_some(frames)}: nothing can be learned from that"
@@ -172,47 +173,28 @@ def _empty_masks(recording: Recording, cameras: Sequence[str], frames: Sequence[
             yield f"the foreground mask of camera {name} is empty at frame {_some(empty)}: white counts as foreground"
 
 
-def _range(image: np.ndarray) -> np.ndarray:
-    """How far the levels of each channel are apart, int [3]."""
-    colours = image.reshape(-1, 3)
-    return colours.max(axis=0).astype(int) - colours.min(axis=0)
-
-
 def calibration_contradicted(recording: Recording) -> tuple[bool, str]:
     """(whether the calibration must be wrong, what `check_recording` says of it or whose swap would mend it; or "")."""
-    names = list(recording.cameras)
-    checked = _checked(recording, names, {name: _features(recording, name) for name in names})
-    said, wrong = _missed(checked), bool(_suspects(checked))
-    swap = _swapped(recording) if wrong else None
-    return (
-        wrong,
-        f"cameras {swap[0]} and {swap[1]} are swapped: exchange their videos or their entries" if swap else said,
-    )
+    features = _features(recording, recording.cameras)
+    checked = _checked(recording, features)
+    wrong = bool(_suspects(checked))
+    swap = _swapped(recording, features) if wrong else None
+    if swap is None:
+        return wrong, _missed(checked)
+    return wrong, f"cameras {swap[0]} and {swap[1]} are swapped: exchange their videos or their entries"
 
 
-def _swapped(recording: Recording) -> tuple[str, str] | None:
+def _swapped(recording: Recording, features: Mapping[str, Features]) -> tuple[str, str] | None:
     """Two cameras of few whose calibrations, exchanged, miss nothing."""
-    names = list(recording.cameras)
-    if not 2 < len(names) <= MOST_SWAPPED:
+    if not 2 < len(features) <= MOST_SWAPPED:
         return None
-    features = {name: _features(recording, name) for name in names}
-    for one, other in combinations(names, 2):
+    for one, other in combinations(features, 2):
         a, b = recording.cameras[one], recording.cameras[other]
         exchanged = {one: replace(b, name=one), other: replace(a, name=other)}
-        trial = replace(recording, cameras={**recording.cameras, **exchanged})
-        checked = _checked(trial, names, features)
+        checked = _checked(replace(recording, cameras={**recording.cameras, **exchanged}), features)
         if checked and not any(pair.missed for pair in checked):
             return one, other
     return None
-
-
-def _contradicted(recording: Recording, cameras: Sequence[str]) -> Iterator[str]:
-    """Pairs whose calibration misses the features that their images share."""
-    if len(cameras) < 2:
-        return
-    said = _missed(_checked(recording, cameras, {name: _features(recording, name) for name in cameras}))
-    if said:
-        yield said
 
 
 def _missed(checked: Sequence[_Pair]) -> str:
@@ -232,8 +214,8 @@ def _missed(checked: Sequence[_Pair]) -> str:
     )
 
 
-def _checked(recording: Recording, cameras: Sequence[str], features: Mapping[str, Features]) -> list[_Pair]:
-    pairs = [_pair(recording, *pair, features) for pair in _neighbours(recording, cameras)]
+def _checked(recording: Recording, features: Mapping[str, Features]) -> list[_Pair]:
+    pairs = (_pair(recording, *pair, features) for pair in _neighbours(recording, features))
     return [pair for pair in pairs if pair is not None]
 
 
@@ -254,22 +236,25 @@ def _suspects(checked: Sequence[_Pair]) -> str:
     return f"cameras {' and '.join(outweighed)}" if 2 * len(outweighed) < len(against) else "these cameras"
 
 
-def _neighbours(recording: Recording, cameras: Sequence[str]) -> list[tuple[str, str]]:
+def _neighbours(recording: Recording, cameras: Iterable[str]) -> list[tuple[str, str]]:
     """All pairs of a few cameras; of many, those that stand nearest to each other."""
-    pairs = [(one, other) for i, one in enumerate(cameras) for other in cameras[i + 1 :]]
     centres = {name: recording.cameras[name].centre for name in cameras}
-    pairs.sort(key=lambda pair: float(np.linalg.norm(centres[pair[0]] - centres[pair[1]])))
-    return pairs[:MOST_PAIRS]
+    pairs = combinations(centres, 2)
+    return sorted(pairs, key=lambda pair: float(np.linalg.norm(centres[pair[0]] - centres[pair[1]])))[:MOST_PAIRS]
 
 
-def _features(recording: Recording, name: str) -> Features:
-    """Of the first image, in pixels of the recording."""
+def _features(recording: Recording, cameras: Iterable[str]) -> dict[str, Features]:
+    """Of the first image of each camera, in pixels of the recording."""
     cv2 = opencv("checking a recording")
-    image = recording.image(name, recording.frames[0])
-    factor = min(LONG_SIDE / max(image.shape[:2]), 1.0)
-    small = cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA) if factor < 1 else image
-    found = find_features([small])
-    return replace(found, pixels=found.pixels * np.array(image.shape[1::-1]) / small.shape[1::-1])
+    features = {}
+    for name in cameras:
+        image = recording.image(name, recording.frames[0])
+        factor = min(LONG_SIDE / max(image.shape[:2]), 1.0)
+        small = cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA) if factor < 1 else image
+        found = find_features([small])
+        pixels = found.pixels * np.array(image.shape[1::-1]) / small.shape[1::-1]
+        features[name] = replace(found, pixels=pixels)
+    return features
 
 
 def _pair(recording: Recording, one: str, other: str, features: Mapping[str, Features]) -> _Pair | None:
@@ -289,7 +274,7 @@ def _pair(recording: Recording, one: str, other: str, features: Mapping[str, Fea
     inside = mask.ravel() > 0 if mask is not None else np.zeros(len(p), bool)
     if inside.sum() < ENOUGH:
         return None
-    off, near = np.abs((epipolar_lines(a, b, p) * homogeneous(q)).sum(axis=1)), max(MISSED * diagonal, 4.0)
+    off, near = np.abs(sampson(a, b, p, q)), max(MISSED * diagonal, 4.0)
     distance, held = float(np.median(off[inside])), off < near
     missed = distance > near and inside.sum() > held.sum()
     return _Pair(one, other, distance, bool(missed), int((inside if missed else held).sum()))
