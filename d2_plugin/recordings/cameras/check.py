@@ -41,11 +41,11 @@ LONG_SIDE = 640  # features are looked for in images of at most this many pixels
 MOST_PAIRS = 12  # pairs of cameras whose features are matched, at most
 ENOUGH = 18  # matches on one geometry, any, below which two images say nothing: false matches reach 14
 MOST_SWAPPED = 6  # cameras of a recording in which two that were swapped are looked for
-MISSED = 0.01  # median distance from the epipolar lines, in diagonals of the image, beyond which a calibration is named
+MISSED = 0.007  # Sampson's distance, its median, in diagonals of the image, beyond which a calibration is named
 
 
 class _Pair(NamedTuple):
-    """Two cameras whose images share features, and the median distance in pixels from the calibration's lines."""
+    """Two cameras whose images share features, and the median of Sampson's distance in pixels."""
 
     one: str
     other: str
@@ -274,7 +274,7 @@ def _pair(recording: Recording, one: str, other: str, features: Mapping[str, Fea
     inside = mask.ravel() > 0 if mask is not None else np.zeros(len(p), bool)
     if inside.sum() < ENOUGH:
         return None
-    off, near = np.abs(sampson(a, b, p, q)), max(MISSED * diagonal, 4.0)
+    off, near = np.abs(sampson(a, b, p, q)), max(MISSED * diagonal, 3.0)
     distance, held = float(np.median(off[inside])), off < near
     missed = distance > near and inside.sum() > held.sum()
     return _Pair(one, other, distance, bool(missed), int((inside if missed else held).sum()))
