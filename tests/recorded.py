@@ -109,8 +109,9 @@ def write_video(
     turn: int = 0,
     sound: np.ndarray | None = None,
     timecode: str | None = None,
+    gop: int = 12,
 ) -> Path:
-    """An MP4 of images RGB uint8 [H, W, 3] shown at `times`, seconds.
+    """An MP4 of images RGB uint8 [H, W, 3] shown at `times`, seconds, with a key frame every `gop` frames.
 
     `turn` is what a player does to show it upright, degrees counter-clockwise: the images are stored turned back.
     """
@@ -120,7 +121,7 @@ def write_video(
         stream = container.add_stream("libx264", rate=rate)
         stored = [np.ascontiguousarray(np.rot90(image, -(turn // 90))) for image in images]
         stream.height, stream.width = stored[0].shape[:2]
-        stream.pix_fmt, stream.options, stream.gop_size = "yuv420p", {"crf": "8", "preset": "veryfast"}, 12
+        stream.pix_fmt, stream.options, stream.gop_size = "yuv420p", {"crf": "8", "preset": "veryfast"}, gop
         stream.time_base = stream.codec_context.time_base = UNIT
         if turn:
             stream.set_display_rotation(turn)

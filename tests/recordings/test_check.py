@@ -16,6 +16,7 @@ from d2_plugin.recordings import Recording, Source, open_recording, select_camer
 from d2_plugin.recordings.cameras import check
 from d2_plugin.recordings.cameras.camera import checked_camera
 from d2_plugin.recordings.cameras.check import check_recording
+from d2_plugin.recordings.cameras.epipolar import rotated
 from d2_plugin.recordings.checks import memory as memory_module
 from d2_plugin.recordings.checks.exposure import relative_exposures
 from d2_plugin.recordings.checks.memory import available_bytes, check_memory, needed_bytes
@@ -77,14 +78,29 @@ def test_one_bad_pair_does_not_overrule_all_others() -> None:
     def said(*missed: str) -> tuple[bool, str]:
         pairs = [(a, b) for a, b in combinations("abcd", 2)]
         checked = [check._Pair(a, b, 151.0 if a + b in missed else 1.0, a + b in missed, 40) for a, b in pairs]
-        return check._outweighed(checked), check._missed(checked)
+        return check._suspects(checked), check._missed(checked)
 
-    wrong, why = said("ad")
-    assert not wrong
+    suspects, why = said("ad")
+    assert suspects == ""
     assert "features of a and d by 151 pixels, but not those of their other pairs" in why
-    wrong, why = said("ad", "bd", "cd")
-    assert wrong
+    suspects, why = said("ad", "bd", "cd")
+    assert suspects == "camera d"
     assert why.endswith("check R, t and K of camera d")
+
+
+@pytest.mark.parametrize("names", [("03", "07", "12", "15"), ("02", "03", "05", "07", "12", "15", "18", "22")])
+def test_a_right_calibration_of_a_real_dome_is_not_called_wrong(names: tuple, shared_data: Callable) -> None:
+    recording = open_recording(shared_data("dome"), cameras=names)
+    assert check.calibration_contradicted(recording) == (False, "")
+
+
+@pytest.mark.parametrize(("bad", "degrees"), [("03", 4), ("07", 3), ("12", 3), ("15", 3), ("22", 3)])
+def test_the_turned_camera_of_a_real_dome_is_named(bad: str, degrees: float, shared_data: Callable) -> None:
+    recording = open_recording(shared_data("dome"))
+    turned = rotated(recording.cameras[bad], np.deg2rad(degrees) * np.array([0.5, 0.5, 0.7]))
+    wrong, why = check.calibration_contradicted(moved(recording, bad, T_camera_world=turned.T_camera_world))
+    assert wrong
+    assert why.endswith(f"check R, t and K of camera {bad}")
 
 
 def test_a_camera_that_looks_away_is_named(room: Recording) -> None:

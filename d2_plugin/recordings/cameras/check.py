@@ -8,7 +8,8 @@ are refused here already, not after the training that they are to score.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations
 from typing import NamedTuple
@@ -16,8 +17,9 @@ from typing import NamedTuple
 import numpy as np
 
 from d2_plugin.errors import D2Error
+from d2_plugin.recordings.cameras.calibrating.features import Features, find_features, match_all
 from d2_plugin.recordings.cameras.camera import field_of_view
-from d2_plugin.recordings.cameras.epipolar import epipolar_lines, homogeneous, sift_features
+from d2_plugin.recordings.cameras.epipolar import sampson
 from d2_plugin.recordings.images import opencv
 from d2_plugin.recordings.recording import Camera, Recording
 from d2_plugin.recordings.selection import spread
@@ -37,20 +39,19 @@ LOOKED_AT = 1 << 25
 
 LONG_SIDE = 640  # features are looked for in images of at most this many pixels along the longer side
 MOST_PAIRS = 12  # pairs of cameras whose features are matched, at most
-ENOUGH = 12  # matched features on one geometry, any, below which two images say nothing about their calibration
-ENOUGH_SHARE = 0.5  # share of the matched features that must lie on one geometry: false matches do not
+ENOUGH = 18  # matches on one geometry, any, below which two images say nothing: false matches reach 14
 MOST_SWAPPED = 6  # cameras of a recording in which two that were swapped are looked for
-MISSED = 0.01  # median distance from the epipolar lines, in diagonals of the image, beyond which a calibration is named
+MISSED = 0.007  # Sampson's distance, its median, in diagonals of the image, beyond which a calibration is named
 
 
 class _Pair(NamedTuple):
-    """Two cameras whose images share features, and the median distance in pixels from the calibration's lines."""
+    """Two cameras whose images share features, and the median of Sampson's distance in pixels."""
 
     one: str
     other: str
     distance: float
     missed: bool
-    matches: int
+    matches: int  # that say so
 
 
 def check_recording(recording: Recording, cameras: Sequence[str], scored: Sequence[str] = ()) -> tuple[str, ...]:
@@ -66,8 +67,9 @@ def check_recording(recording: Recording, cameras: Sequence[str], scored: Sequen
         for frame in _frames(recording, len(scored)):
             recording.depth(name, frame)
     masks = _empty_masks(recording, cameras, _frames(recording, len(cameras)))
-    seen = (*_views(rig), *_origin(rig), *_alone(rig), *_plain(recording, cameras))
-    return (*seen, *masks, *_contradicted(recording, cameras))
+    seen = (*_views(rig), *_origin(rig), *_alone(rig), *_plain(recording, cameras), *masks)
+    said = _missed(_checked(recording, _features(recording, cameras)))
+    return (*seen, said) if said else seen
 
 
 def check_background_weight(recording: Recording, cameras: Sequence[str], weight: float) -> None:
@@ -142,7 +144,7 @@ def _plain(recording: Recording, cameras: Sequence[str]) -> Iterator[str]:
         blank: dict[str, list[int]] = {}
         for frame in _frames(recording, len(cameras)):
             image = recording.image(name, frame)
-            if all(_range(part).max() <= ONE_COLOUR for part in (image[::SPARSE, ::SPARSE], image)):
+            if all(np.ptp(part, axis=(0, 1)).max() <= ONE_COLOUR for part in (image[::SPARSE, ::SPARSE], image)):
                 blank.setdefault("black" if image.max() <= ONE_COLOUR else "of one colour", []).append(frame)
         for what, frames in blank.items():
             yield f"camera {name} is {what} at frame {_some(frames)}: nothing can be learned from that"
@@ -171,56 +173,28 @@ def _empty_masks(recording: Recording, cameras: Sequence[str], frames: Sequence[
             yield f"the foreground mask of camera {name} is empty at frame {_some(empty)}: white counts as foreground"
 
 
-def _range(image: np.ndarray) -> np.ndarray:
-    """How far the levels of each channel are apart, int [3]."""
-    colours = image.reshape(-1, 3)
-    return colours.max(axis=0).astype(int) - colours.min(axis=0)
-
-
 def calibration_contradicted(recording: Recording) -> tuple[bool, str]:
     """(whether the calibration must be wrong, what `check_recording` says of it or whose swap would mend it; or "")."""
-    names = list(recording.cameras)
-    checked = _checked(recording, names, {name: _features(recording, name) for name in names})
-    said, wrong = _missed(checked), _outweighed(checked)
-    swap = _swapped(recording) if wrong else None
-    return (
-        wrong,
-        f"cameras {swap[0]} and {swap[1]} are swapped: exchange their videos or their entries" if swap else said,
-    )
+    features = _features(recording, recording.cameras)
+    checked = _checked(recording, features)
+    wrong = bool(_suspects(checked))
+    swap = _swapped(recording, features) if wrong else None
+    if swap is None:
+        return wrong, _missed(checked)
+    return wrong, f"cameras {swap[0]} and {swap[1]} are swapped: exchange their videos or their entries"
 
 
-def _outweighed(checked: Sequence[_Pair]) -> bool:
-    """Whether more matches of some camera speak against the calibration than for it: one bad pair of many does not."""
-    for name in {name for pair in checked for name in pair[:2]}:
-        votes = [pair.matches * (1 if pair.missed else -1) for pair in checked if name in pair[:2]]
-        if sum(votes) > 0:
-            return True
-    return False
-
-
-def _swapped(recording: Recording) -> tuple[str, str] | None:
+def _swapped(recording: Recording, features: Mapping[str, Features]) -> tuple[str, str] | None:
     """Two cameras of few whose calibrations, exchanged, miss nothing."""
-    names = list(recording.cameras)
-    if not 2 < len(names) <= MOST_SWAPPED:
+    if not 2 < len(features) <= MOST_SWAPPED:
         return None
-    features = {name: _features(recording, name) for name in names}
-    for one, other in combinations(names, 2):
+    for one, other in combinations(features, 2):
         a, b = recording.cameras[one], recording.cameras[other]
         exchanged = {one: replace(b, name=one), other: replace(a, name=other)}
-        trial = replace(recording, cameras={**recording.cameras, **exchanged})
-        checked = _checked(trial, names, features)
+        checked = _checked(replace(recording, cameras={**recording.cameras, **exchanged}), features)
         if checked and not any(pair.missed for pair in checked):
             return one, other
     return None
-
-
-def _contradicted(recording: Recording, cameras: Sequence[str]) -> Iterator[str]:
-    """Pairs whose calibration misses the features that their images share."""
-    if len(cameras) < 2:
-        return
-    said = _missed(_checked(recording, cameras, {name: _features(recording, name) for name in cameras}))
-    if said:
-        yield said
 
 
 def _missed(checked: Sequence[_Pair]) -> str:
@@ -228,73 +202,79 @@ def _missed(checked: Sequence[_Pair]) -> str:
     listed = ", ".join(f"{pair.one} and {pair.other} by {pair.distance:.0f} pixels" for pair in wrong[:4])
     if not wrong:
         return ""
-    if not _outweighed(checked):
+    suspects = _suspects(checked)
+    if not suspects:
         return (
             f"the calibration misses features of {listed}, but not those of their other pairs, which are more: most "
             "likely a pattern that repeats, so it stands"
         )
-    suspects = _suspects(checked)
-    whose = f"camera {' and '.join(suspects)}" if suspects else "these cameras"
     return (
         f"the calibration misses features that two images share, {listed}{', ...' if len(wrong) > 4 else ''} "
-        f"(median; good calibrations miss by one): check R, t and K of {whose}"
+        f"(median; good calibrations miss by one): check R, t and K of {suspects}"
     )
 
 
-def _checked(recording: Recording, cameras: Sequence[str], features: Mapping[str, _Features]) -> list[_Pair]:
-    pairs = [_pair(recording, *pair, features) for pair in _neighbours(recording, cameras)]
+def _checked(recording: Recording, features: Mapping[str, Features]) -> list[_Pair]:
+    pairs = (_pair(recording, *pair, features) for pair in _neighbours(recording, features))
     return [pair for pair in pairs if pair is not None]
 
 
-def _suspects(checked: Sequence[_Pair]) -> list[str]:
-    """Cameras of which every pair is missed, where that leaves pairs that are not, or the one they all share."""
-    names = list(dict.fromkeys(name for pair in checked for name in pair[:2]))
-    all_missed = [name for name in names if all(pair.missed for pair in checked if name in pair[:2])]
-    if len(all_missed) < len(names):
-        return all_missed
-    shared = [name for name in names if all(name in pair[:2] for pair in checked)]
-    return shared if len(checked) > 1 else []
+def _suspects(checked: Sequence[_Pair]) -> str:
+    """The cameras that may be wrong; none where more matches of each speak for the calibration than against it."""
+    against: Counter[str] = Counter()
+    for pair in checked:
+        for name in pair[:2]:
+            against[name] += pair.matches if pair.missed else -pair.matches
+    outweighed = sorted(name for name, matches in against.items() if matches > 0)
+    if not outweighed:
+        return ""
+    # Whoever is in all missed pairs may be the only one. A turn can leave single pairs as they were, so the others'
+    # good pairs clear nobody.
+    any_one = set.intersection(*(set(pair[:2]) for pair in checked if pair.missed))
+    if any_one:
+        return f"camera {' or '.join(sorted(any_one))}"
+    return f"cameras {' and '.join(outweighed)}" if 2 * len(outweighed) < len(against) else "these cameras"
 
 
-def _neighbours(recording: Recording, cameras: Sequence[str]) -> list[tuple[str, str]]:
+def _neighbours(recording: Recording, cameras: Iterable[str]) -> list[tuple[str, str]]:
     """All pairs of a few cameras; of many, those that stand nearest to each other."""
-    pairs = [(one, other) for i, one in enumerate(cameras) for other in cameras[i + 1 :]]
     centres = {name: recording.cameras[name].centre for name in cameras}
-    pairs.sort(key=lambda pair: float(np.linalg.norm(centres[pair[0]] - centres[pair[1]])))
-    return pairs[:MOST_PAIRS]
+    pairs = combinations(centres, 2)
+    return sorted(pairs, key=lambda pair: float(np.linalg.norm(centres[pair[0]] - centres[pair[1]])))[:MOST_PAIRS]
 
 
-_Features = tuple[np.ndarray, np.ndarray]
-
-
-def _features(recording: Recording, name: str) -> _Features:
-    """Positions [n, 2] in pixels of the recording (centres at i + 0.5) and descriptors of the first image."""
+def _features(recording: Recording, cameras: Iterable[str]) -> dict[str, Features]:
+    """Of the first image of each camera, in pixels of the recording."""
     cv2 = opencv("checking a recording")
-    image = recording.image(name, recording.frames[0])
-    factor = min(LONG_SIDE / max(image.shape[:2]), 1.0)
-    small = cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA) if factor < 1 else image
-    pixels, descriptors, _ = sift_features(small, 1000, "checking a recording")
-    return pixels * np.array(image.shape[1::-1]) / small.shape[1::-1], descriptors
+    features = {}
+    for name in cameras:
+        image = recording.image(name, recording.frames[0])
+        factor = min(LONG_SIDE / max(image.shape[:2]), 1.0)
+        small = cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA) if factor < 1 else image
+        found = find_features([small])
+        pixels = found.pixels * np.array(image.shape[1::-1]) / small.shape[1::-1]
+        features[name] = replace(found, pixels=pixels)
+    return features
 
 
-def _pair(recording: Recording, one: str, other: str, features: Mapping[str, _Features]) -> _Pair | None:
-    """How far the calibration misses the features that two images share; None where they share too few."""
+def _pair(recording: Recording, one: str, other: str, features: Mapping[str, Features]) -> _Pair | None:
+    """How far the calibration misses the features that two images share; None where they share too few.
+
+    It misses them where another geometry explains more matches exactly than the calibration does roughly: patterns
+    that repeat have a geometry of their own, but what the calibration explains is more.
+    """
     cv2 = opencv("checking a recording")
-    (points, descriptors), (others, other_descriptors) = features[one], features[other]
-    if min(len(points), len(others)) < ENOUGH:
-        return None
-    two_best = cv2.BFMatcher().knnMatch(descriptors, other_descriptors, k=2)
-    good = [best for best, second in two_best if best.distance < 0.8 * second.distance]
-    once = list({match.trainIdx: match for match in good}.values())
-    if len(once) < ENOUGH:
-        return None
-    p, q = points[[match.queryIdx for match in once]], others[[match.trainIdx for match in once]]
     a, b = recording.cameras[one], recording.cameras[other]
+    matches = match_all({one: features[one], other: features[other]})[one, other]
+    if len(matches) < ENOUGH or np.allclose(a.centre, b.centre):
+        return None
+    p, q = features[one].pixels[matches[:, 0]], features[other].pixels[matches[:, 1]]
     diagonal = float(np.hypot(a.width, a.height))
     _, mask = cv2.findFundamentalMat(p, q, cv2.FM_RANSAC, max(diagonal / 500, 1.0), 0.999, 2000)
     inside = mask.ravel() > 0 if mask is not None else np.zeros(len(p), bool)
-    if inside.sum() < max(ENOUGH, ENOUGH_SHARE * len(p)) or np.allclose(a.centre, b.centre):
+    if inside.sum() < ENOUGH:
         return None
-    off = np.abs((epipolar_lines(a, b, p[inside]) * homogeneous(q[inside])).sum(axis=1))
-    distance = float(np.median(off))
-    return _Pair(one, other, distance, distance > max(MISSED * diagonal, 4.0), int(inside.sum()))
+    off, near = np.abs(sampson(a, b, p, q)), max(MISSED * diagonal, 3.0)
+    distance, held = float(np.median(off[inside])), off < near
+    missed = distance > near and inside.sum() > held.sum()
+    return _Pair(one, other, distance, bool(missed), int((inside if missed else held).sum()))

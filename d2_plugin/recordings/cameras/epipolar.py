@@ -13,7 +13,6 @@ from d2_plugin.recordings.recording import Camera
 
 OPENCVS_CONTRAST = 0.04  # of a SIFT feature, at least
 
-
 SCALES = (16.0, 8.0, 4.0, 2.0, 1.0, 1.0, 0.5, 0.5)  # pixels beyond which a match hardly counts, round by round
 LARGEST_TURN = 0.05  # radians of one step
 
@@ -58,24 +57,12 @@ def fundamental(one: Camera, other: Camera) -> np.ndarray:
     return product
 
 
-def homogeneous(pixels: np.ndarray) -> np.ndarray:
-    """Pixels [n, 2] with a third column of ones."""
-    return np.column_stack([pixels, np.ones(len(pixels))])
-
-
-def epipolar_lines(one: Camera, other: Camera, pixels: np.ndarray) -> np.ndarray:
-    """Lines [n, 3] in `other` on which it sees what `one` sees at pixels [n, 2]; their product with a pixel is the
-    distance."""
-    lines = homogeneous(pixels) @ fundamental(one, other).T
-    return lines / np.linalg.norm(lines[:, :2], axis=1, keepdims=True).clip(1e-300)
-
-
 def sampson(one: Camera, other: Camera, p: np.ndarray, q: np.ndarray) -> np.ndarray:
     """Distance [n] in pixels, to first order and signed, of pairs [n, 2] from the nearest that two cameras allow."""
-    F = fundamental(one, other)
-    there, back = homogeneous(p) @ F.T, homogeneous(q) @ F
+    F, ones = fundamental(one, other), np.ones((len(p), 1))
+    there, back = np.hstack([p, ones]) @ F.T, np.hstack([q, ones]) @ F
     squares = (there[:, :2] ** 2).sum(axis=1) + (back[:, :2] ** 2).sum(axis=1)
-    distance: np.ndarray = (homogeneous(q) * there).sum(axis=1) / np.sqrt(squares).clip(1e-300)
+    distance: np.ndarray = (np.hstack([q, ones]) * there).sum(axis=1) / np.sqrt(squares).clip(1e-300)
     return distance
 
 

@@ -1,32 +1,27 @@
 """Each camera's gain, from pixels of two cameras that show the same point of a surface.
 
-Features of two images of one instant are matched, and kept where they lie on the epipolar lines of the calibration.
+Features of two images of one instant are matched, and kept where the calibration allows both places.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import combinations
 
 import numpy as np
 
-from d2_plugin.recordings.cameras.epipolar import epipolar_lines, homogeneous, sampson, sift_features
+from d2_plugin.recordings.cameras.calibrating.features import find_features, match_all
+from d2_plugin.recordings.cameras.epipolar import sampson
+from d2_plugin.recordings.checks.exposure import BRIGHT, DARK
 from d2_plugin.recordings.images import opencv
 from d2_plugin.recordings.importing.clocks import linked_names
-from d2_plugin.recordings.recording import Camera, Exposure, Recording
+from d2_plugin.recordings.recording import Exposure, Recording
 from d2_plugin.recordings.selection import spread
 
 FRAMES = 6  # instants at which features are looked for, at most
 KNOWN = 0.004  # standard error of all gains at which no more instants are looked at
-FEATURES = 3000  # of an image, at most
 DIAGONAL = 1 / 800  # of the image: how far two features may lie from places that a calibration allows
-DISTINCT = 0.8  # A match is kept where the second best is this much farther away (Lowe 2004)
-
-LIKELY = 380.0
-"""A match whose descriptor differs by more than `DISTINCT` times this is none: SIFT's have the length 512."""
 
 FEWEST = 20  # matches of two cameras, over all instants, that a gain takes
-DARK, BRIGHT = 10, 245  # values of a pixel, of 255, beyond which a channel says nothing about gain: noise, or clipped
 
 
 def measured_exposures(recording: Recording, cameras: Sequence[str]) -> dict[str, Exposure]:
@@ -38,38 +33,19 @@ def measured_exposures(recording: Recording, cameras: Sequence[str]) -> dict[str
     gains: dict[str, Exposure] = {}
     for frame in spread(recording.frames, FRAMES):
         images = {name: recording.image(name, frame) for name in cameras}
-        features = {name: sift_features(image, FEATURES, "measuring exposure")[:2] for name, image in images.items()}
-        for one, other in combinations(cameras, 2):
-            p, q = _matched(recording.cameras[one], recording.cameras[other], features[one], features[other])
-            if len(p):
-                a, b = _around(images[one], p), _around(images[other], q)
-                ratios.setdefault((one, other), []).append(b - a)
+        features = {name: find_features([image]) for name, image in images.items()}
+        for (one, other), matches in match_all(features).items():
+            p, q = features[one].pixels[matches[:, 0]], features[other].pixels[matches[:, 1]]
+            a, b = recording.cameras[one], recording.cameras[other]
+            near = np.abs(sampson(a, b, p, q)) < max(DIAGONAL * np.hypot(b.width, b.height), 0.7)
+            if near.any():
+                ratio = _around(images[other], q[near]) - _around(images[one], p[near])
+                ratios.setdefault((one, other), []).append(ratio)
         joined = {pair: np.concatenate(parts) for pair, parts in ratios.items()}
         gains = _gains(cameras, {pair: _middle(values) for pair, values in joined.items() if len(values) >= FEWEST})
         if len(gains) == len(cameras) and max(max(one.error) for one in gains.values()) < KNOWN:
             break
     return gains
-
-
-_Features = tuple[np.ndarray, np.ndarray]
-
-
-def _matched(one: Camera, other: Camera, features: _Features, others: _Features) -> _Features:
-    """Places [n, 2] of the same points in two images: each is the other's best by far along its epipolar line."""
-    (p, descriptors), (q, other_descriptors) = features, others
-    if not len(p) or not len(q) or np.allclose(one.centre, other.centre):
-        return np.zeros((0, 2)), np.zeros((0, 2))
-    reach = max(DIAGONAL * np.hypot(other.width, other.height), 0.7)
-    off = epipolar_lines(one, other, p).astype(np.float32) @ homogeneous(q).T.astype(np.float32)
-    squares = (descriptors**2).sum(1)[:, None] + (other_descriptors**2).sum(1) - 2 * descriptors @ other_descriptors.T
-    squares[np.abs(off) > 2 * reach] = np.inf
-    best, back = squares.argmin(1), squares.argmin(0)
-    two = np.partition(squares, 1, axis=1)[:, :2] if len(q) > 1 else squares[:, [0, 0]]
-    first, second = np.sqrt(np.maximum(two, 0)).T
-    kept = np.isfinite(first) & (first < DISTINCT * np.minimum(second, LIKELY)) & (back[best] == np.arange(len(p)))
-    p, q = p[kept], q[best[kept]]
-    near = np.abs(sampson(one, other, p, q)) < reach
-    return p[near], q[near]
 
 
 def _around(image: np.ndarray, places: np.ndarray) -> np.ndarray:

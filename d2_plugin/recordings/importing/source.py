@@ -21,7 +21,7 @@ from d2_plugin.recordings.importing.video import VideoFile, VideoFrames
 from d2_plugin.recordings.recording import Camera, Recording, Source
 from d2_plugin.recordings.selection import spread
 
-MOMENTS = 9  # images of each camera that are checked, spread over the recording
+MOMENTS = 6  # images of each camera that are checked, spread over the recording: decoding them is most of an import
 LONG_SIDE = 640  # pixels of the longer side of these, at most
 
 

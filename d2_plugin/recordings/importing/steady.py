@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from d2_plugin.recordings.cameras.epipolar import Sift, sift_features
+from d2_plugin.recordings.checks.exposure import BRIGHT, DARK
 from d2_plugin.recordings.images import opencv
 from d2_plugin.recordings.recording import Recording
 
@@ -18,7 +19,6 @@ SPREAD = 0.4  # part of the image's width and height over which these lie, at le
 TELLS = 5.0  # levels of 255 by which a pixel must change where the image is moved back, to say whether that is right
 EXPLAINS = 0.6  # share of these that say so, at least: where a person walks the wall behind him does not
 DRIFT = 0.05  # share by which the exposure may change unmentioned
-USABLE = (10, 245)  # brightness of pixels, of 255, that say something about a gain
 
 
 class Steadiness(NamedTuple):
@@ -41,7 +41,7 @@ def _steadiness(recording: Recording, camera: str) -> Steadiness:
     small = [cv2.resize(image, None, fx=1 / scale, fy=1 / scale, interpolation=cv2.INTER_AREA) for image in taken]
     images = np.stack([cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in small]).astype(np.float32)
     still = np.median(images, axis=0)
-    usable = (images > USABLE[0]) & (images < USABLE[1])
+    usable = (images > DARK) & (images < BRIGHT)
     gains = np.array(
         [np.median((image / np.maximum(still, 1))[mask]) if mask.any() else 1.0 for image, mask in zip(images, usable)]
     )

@@ -39,9 +39,6 @@ _log = logging.getLogger(__name__)
 
 REMEDY = "replace the file or leave its camera out"
 
-SKIP_LIMIT = 48
-"""A frame at most this far ahead is reached by decoding on; any other by a seek, which starts at a key frame."""
-
 MOST_FRAMES = 10_000_000  # A video that has more is damaged: this many are four days at 30 per second
 
 OPENING = {
@@ -65,6 +62,7 @@ class VideoFile:
     counted: bool = (
         False  # frames are found by their order, since what the container says of their times is not ordered
     )
+    keys: tuple[int, ...] = ()  # frames that need no other one, ascending, as the container knows them
     hdr: str = ""  # how its colours are coded where that is no BT.709, such as "PQ, BT.2020"; they are converted
 
     @property
@@ -100,7 +98,8 @@ class VideoFile:
     def from_dict(cls, table: Mapping[str, Any]) -> VideoFile:
         """What `as_dict` made."""
         arrays = {"stamps": np.array(table["stamps"], np.int64), "stored_size": tuple(table["stored_size"])}
-        return cls(**{**table, **arrays, "path": Path(table["path"]), "unit": Fraction(*table["unit"])})
+        keys = tuple(table.get("keys", ()))
+        return cls(**{**table, **arrays, "keys": keys, "path": Path(table["path"]), "unit": Fraction(*table["unit"])})
 
 
 def _remedy(path: Path) -> str:
@@ -148,7 +147,7 @@ def read_video(path: Path) -> VideoFile:
             raise D2Error(f"{shown_path(path)} holds {kinds} and no image: give a video of the camera")
         stream = container.streams.video[0]
         counted, unit = container.format.name == "avi", Fraction(stream.time_base)
-        stamps = _stamps(container.decode(stream) if counted else _packets(container, stream), path)
+        stamps, keys = _stamps(container.decode(stream) if counted else _packets(container, stream), path)
         places = [container, *container.streams.video, *container.streams]
         timecode = next((place.metadata["timecode"] for place in places if "timecode" in place.metadata), None)
         sound = bool(container.streams.audio)
@@ -157,7 +156,8 @@ def read_video(path: Path) -> VideoFile:
     coding = [
         name for table, code in ((HDR, first.color_trc), (WIDE, first.color_primaries)) if (name := table.get(code))
     ]
-    return VideoFile(path, (first.width, first.height), turn, stamps, unit, timecode, sound, counted, ", ".join(coding))
+    size, hdr = (first.width, first.height), ", ".join(coding)
+    return VideoFile(path, size, turn, stamps, unit, timecode, sound, counted, keys, hdr)
 
 
 def _packets(container: Any, stream: Any) -> Iterator[Any]:
@@ -165,18 +165,19 @@ def _packets(container: Any, stream: Any) -> Iterator[Any]:
     return (packet for packet in container.demux(stream) if packet.size and not packet.is_discard)
 
 
-def _stamps(shown: Iterator[Any], path: Path) -> np.ndarray:
-    """When each frame is shown, ascending, of packets or of decoded frames."""
-    stamps: set[int] = set()
+def _stamps(shown: Iterator[Any], path: Path) -> tuple[np.ndarray, tuple[int, ...]]:
+    """(when each frame is shown, ascending, of packets or of decoded frames, `VideoFile.keys` of packets)."""
+    stamps: dict[int, bool] = {}
     for one in shown:
         stamp = one.dts if one.pts is None else one.pts
         if stamp is not None:
-            stamps.add(stamp)
+            stamps[stamp] = getattr(one, "is_keyframe", False)
         if len(stamps) > MOST_FRAMES:
             raise D2Error(f"video {shown_path(path)} has more than {MOST_FRAMES} frames: {_remedy(path)}")
     if not stamps:
         raise D2Error(f"video {shown_path(path)} has no frame: {_remedy(path)}")
-    return np.array(sorted(stamps), np.int64)
+    ordered = sorted(stamps)
+    return np.array(ordered, np.int64), tuple(place for place, stamp in enumerate(ordered) if stamps[stamp])
 
 
 def _first_frame(path: Path) -> Any:
@@ -212,13 +213,7 @@ def videos_below(folder: Path) -> tuple[Path, ...]:
 
 def decoded_alone(video: VideoFile, index: int) -> int:
     """The last frame up to `index` that needs no other one, where the container knows it."""
-    if video.counted:
-        return index
-    with container_of(video.path) as container:
-        stream = container.streams.video[0]
-        container.seek(int(video.stamps[index]), stream=stream, backward=True)
-        stamp = next(container.demux(stream)).pts
-    return index if stamp is None else min(int(np.searchsorted(video.stamps, stamp)), index)
+    return max((key for key in video.keys if key <= index), default=index)
 
 
 class Decoder:
@@ -292,14 +287,15 @@ class Decoder:
         return -1 if stamp is None else int(np.searchsorted(self.video.stamps, stamp))
 
     def _approach(self, index: int) -> None:
-        """Open the file where it is not, and stand at most `SKIP_LIMIT` frames before `index` if one can."""
+        """Open the file where it is not, and stand at the last key frame before `index` or, nearer, where one is."""
         if self.video.counted and index <= self._reached:
             self.close()
         if self._container is None:
             self._container = open_container(self.video.path)
             self._container.streams.video[0].thread_type = "AUTO"
             self._frames = self._container.decode(video=0)
-        if not self.video.counted and not 0 < index - self._reached <= SKIP_LIMIT:
+        behind = index <= self._reached
+        if not self.video.counted and (behind or decoded_alone(self.video, index) > self._reached + 1):
             stream = self._container.streams.video[0]
             self._container.seek(int(self.video.stamps[index]), stream=stream, backward=True)
             self._frames = self._container.decode(video=0)

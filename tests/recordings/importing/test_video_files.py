@@ -68,6 +68,21 @@ def test_frames_in_any_order_are_the_same(unsteady: tuple[Path, np.ndarray]) -> 
     assert all((decoder.image(index) == kept[index]).all() for index in (17, 3, 29))
 
 
+@pytest.mark.parametrize(("gop", "decoded"), [(150, 121), (30, 40)])
+def test_no_frame_is_decoded_that_a_key_frame_makes_needless_nor_twice(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, gop: int, decoded: int
+) -> None:
+    """Moments far apart, in a video with one key frame, and in one with several."""
+    path = write_video(tmp_path / "a.mp4", images(64)[:50] * 3, list(np.arange(150) / 30), gop=gop)
+    placed, place = [], Decoder._place
+    monkeypatch.setattr(Decoder, "_place", lambda self, frame: placed.append(place(self, frame)) or placed[-1])
+    decoder = Decoder(read_video(path))
+    for index in (0, 60, 65, 120):
+        decoder.image(index)
+    assert len(placed) == len(set(placed)) <= decoded
+    assert placed == sorted(placed)
+
+
 @pytest.mark.parametrize("turn", [0, 90, 180, 270])
 def test_images_stand_as_players_show_them(tmp_path: Path, turn: int) -> None:
     path = write_video(tmp_path / "a.mp4", images(3), [0, 0.04, 0.08], turn=turn)

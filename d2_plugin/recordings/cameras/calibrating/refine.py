@@ -37,8 +37,6 @@ TURNED = 0.15  # degrees by which a camera that is called wrong is turned: a qua
 
 VAGUE = 1.0  # degrees: a pose that is known no better is not held to be right
 
-CHECKED = 3  # moments of images that poses are only held against
-
 REACH = 0.04  # matches farther from where the given poses expect them are not believed, in diagonals of the image
 
 SCHEDULE = ((20.0, 1.3), (10.0, 1.3), (2.5, 0.4), (1.3, 0.13))
@@ -50,8 +48,8 @@ FEWEST_SEEN = 8
 FALLS_TO = 0.9  # the error of the other half falls at least to this part of what it was
 
 BEYOND_DOUBT = 1.0
-"""The poses turn or move by more than this many times what the two halves' poses differ by, which is about two
-standard deviations of the result."""
+"""Poses turn or move by more than this many times what the two halves' poses differ by, which is about two standard
+deviations of the result."""
 
 CELLS = 8  # across and down an image; alternating ones are the two halves, as on a board for chess
 
@@ -97,7 +95,7 @@ def refine(recording: Recording, cameras: Sequence[str] | None = None, moments: 
         raise D2Error(f"poses are refined between cameras, and {recording.name} has {len(names)} to train: name two")
     frames = spread(recording.frames, moments)
     features = {
-        name: of_a_still_camera([recording.image(name, frame) for frame in frames], recording.recorded(name))
+        name: of_a_still_camera([recording.image(name, frame) for frame in frames], recording.recorded(name), True)
         for name in names
     }
     return refine_poses({name: recording.cameras[name] for name in names}, features)
@@ -105,14 +103,14 @@ def refine(recording: Recording, cameras: Sequence[str] | None = None, moments: 
 
 @checked_arguments
 def check_poses(recording: Recording) -> dict[str, Turn]:
-    """What images of a few moments say about the orientation of each camera; none where they share too little.
+    """What all images say about the orientation of each camera; none where they share too little.
 
     Raises:
         D2Error: fewer than two cameras, or pycolmap or OpenCV is not installed.
     """
-    frames = spread(recording.frames, CHECKED)
     features = {
-        name: of_a_still_camera([recording.image(name, frame) for frame in frames]) for name in recording.cameras
+        name: of_a_still_camera([recording.image(name, frame) for frame in recording.frames])
+        for name in recording.cameras
     }
     return _turns(recording.cameras, *_expected(recording.cameras, features)[:2])[0]
 
@@ -158,14 +156,18 @@ def _turns(
         tried = {}
         for name in {name: None for pair in matches for name in pair if name not in turns}:
             trials = [turned(name, cameras, _places(half, features)) for half in (*halves, matches)]
-            before = [_rms(cameras, half, features) for half in halves]
-            after = [_rms({**cameras, name: trials[1 - i]}, half, features) for i, half in enumerate(halves)]
+            own = [_of(name, half) for half in halves]
+            before = [_squares(cameras, half, features) for half in own]
+            after = [_squares({**cameras, name: trials[1 - i]}, half, features) for i, half in enumerate(own)]
+            falls = all(new.sum() < FALLS_TO**2 * old.sum() for new, old in zip(after, before, strict=True))
             degrees, doubt = degrees_between(trials[2], cameras[name]), degrees_between(*trials[:2])
-            proven = all(map(lambda new, old: new < FALLS_TO * old, after, before)) and degrees > max(TURNED, 2 * doubt)
-            tried[name] = sum(after), trials[2], Turn(degrees, doubt, _misses(name, given, matches, features), proven)
-        best = min(tried, key=lambda name: tried[name][0], default=None)
-        if best is None or not tried[best][2].wrong:
-            return {**turns, **{name: turn._replace(wrong=False) for name, (_, _, turn) in tried.items()}}, cameras
+            wrong = falls and degrees > max(TURNED, BEYOND_DOUBT * doubt)
+            change = sum(float(new.sum() - old.sum()) for new, old in zip(after, before, strict=True))
+            tried[name] = change, trials[2], Turn(degrees, doubt, _misses(name, given, matches, features), wrong)
+        proven = [name for name, (_, _, turn) in tried.items() if turn.wrong]
+        if not proven:
+            return {**turns, **{name: turn for name, (_, _, turn) in tried.items()}}, cameras
+        best = min(proven, key=lambda name: tried[name][0])
         _, cameras[best], turns[best] = tried[best]
 
 
@@ -177,8 +179,13 @@ def _places(matches: Matches, features: Mapping[str, Features]) -> Matched:
     }
 
 
+def _of(name: str, matches: Matches) -> Matches:
+    """The matches of one camera: what pairs of others miss would hide what it does."""
+    return {pair: pairs for pair, pairs in matches.items() if name in pair}
+
+
 def _misses(name: str, cameras: Mapping[str, Camera], matches: Matches, features: Mapping[str, Features]) -> float:
-    own = _places({pair: pairs for pair, pairs in matches.items() if name in pair}, features)
+    own = _places(_of(name, matches), features)
     return float(
         np.median(np.abs(np.concatenate([sampson(cameras[a], cameras[b], *ends) for (a, b), ends in own.items()])))
     )
@@ -267,13 +274,18 @@ def _undetermined(given: Mapping[str, Camera], tracks: Sequence[Tracks]) -> str:
 
 
 def _rms(cameras: Mapping[str, Camera], matches: Matches, features: Mapping[str, Features]) -> float:
-    """Root mean square of Sampson's distance, pixels, where a match counts for no more than twice `pixel_error`."""
+    """Root mean square of Sampson's distance, pixels, as `_squares` has it."""
+    squares = _squares(cameras, matches, features)
+    return float(np.sqrt(squares.mean())) if len(squares) else 0.0
+
+
+def _squares(cameras: Mapping[str, Camera], matches: Matches, features: Mapping[str, Features]) -> np.ndarray:
+    """Squares [n] of Sampson's distance, where a match counts for no more than twice `pixel_error`."""
     squares = [np.zeros(0)]
     for (a, b), pairs in matches.items():
         p, q = features[a].pixels[pairs[:, 0]], features[b].pixels[pairs[:, 1]]
         squares.append(np.minimum(np.abs(sampson(cameras[a], cameras[b], p, q)), 2 * pixel_error(cameras[a])) ** 2)
-    joined = np.concatenate(squares)
-    return float(np.sqrt(joined.mean())) if len(joined) else 0.0
+    return np.concatenate(squares)
 
 
 def _judged(
