@@ -283,7 +283,7 @@ class D2Hooks:
 
     def _context(self, step: int, views: Sequence) -> Context:
         def sample() -> Sequence:
-            first = 0 if self._evaluated else self._sampler.cameras
+            first = 0 if self._evaluated else len({view.camera for view in self._sampler.known()})
             self._evaluated = True
             return self._sampler.sample(max(self.config.views_per_evaluation, first), self.generator)
 

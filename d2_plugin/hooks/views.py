@@ -34,11 +34,6 @@ class ViewSampler:
         """The known views, in the order in which they were first seen."""
         return self._views.values()
 
-    @property
-    def cameras(self) -> int:
-        """How many cameras have been seen so far."""
-        return len({camera for camera, _ in self._views})
-
     def sample(self, count: int, generator: torch.Generator) -> Sequence[View]:
         """At most `count` different views; over several calls every known view comes once before any comes again."""
         cameras = sorted({camera for camera, _ in self._views})
