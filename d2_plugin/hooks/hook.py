@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, NamedTuple, TypeVar
@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from d2_plugin.hooks.expected import check_device, check_splats
-from d2_plugin.hooks.prior import PriorLoader
+from d2_plugin.hooks.prior import Kept, PriorLoader
 from d2_plugin.protocol import Backbone, DepthPrior, Edit, Splats, Survey, View
 from d2_plugin.rasterizer import survey
 from d2_plugin.settings import Every, Settings, Steps
@@ -99,11 +99,16 @@ class Context:
         pairs = [(view, self.prior(view)) for view in self.sample()]
         return [self._survey(view, prior) for view, prior in pairs if prior is not None]
 
+    def underway(self, views: Iterable[View]) -> list[tuple[View, Kept]]:
+        """What lies halfway from each view to the camera's next instant, where it is to be known."""
+        asked = views if self.inserts_halfway else ()
+        pairs = (self.prior.underway(view, self.instants(view.camera)) for view in asked)
+        return [pair for pair in pairs if pair is not None]
+
     @cached_property
     def halfway(self) -> list[Surveyed]:
-        """What lies halfway from each view of `evaluation` to the camera's next instant, where it is to be known."""
-        seen = [surveyed.view for surveyed in self.evaluation] if self.inserts_halfway else []
-        pairs = [pair for view in seen if (pair := self.prior.underway(view, self.instants(view.camera))) is not None]
+        """The same of the views of `evaluation`, surveyed."""
+        pairs = self.underway(surveyed.view for surveyed in self.evaluation)
         return [self._survey(view, self.prior.believed(kept.prior(view.K.device))) for view, kept in pairs]
 
     @torch.no_grad()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, NamedTuple
 
@@ -55,8 +55,8 @@ class PruneConfig(HookConfig):
     """Whether standing in space that the prior says is free counts as inconsistency too, and removes after
     `score_stop`; the paper has no such term."""
     unseen: Share = 0.02
-    """Compositing weight that a Gaussian reaches in some pixel of some training view, or goes at `score_stop`; 0: all
-    stay. Runs with less than four steps for each view have not shown each what it needs, and all stay there as well."""
+    """Compositing weight that a Gaussian reaches in some pixel of some training view, or halfway to its next instant
+    where that is known, or goes at `score_stop`; 0: all stay, as in runs with less than four steps for each view."""
     light: Share = 0.05
     """Largest share of the light in the surveyed views that one evaluation takes away: the faintest go first, the rest
     waits with its evidence for the next. 1 sets no limit, as the paper. What a random start has in front of every
@@ -129,7 +129,7 @@ def floating(sums: Sums) -> Tensor:
 
 
 @torch.no_grad()
-def largest_weights(backbone: Backbone, views: Collection[View]) -> Tensor:
+def largest_weights(backbone: Backbone, views: Sequence[View]) -> Tensor:
     """The largest compositing weight [N] that each Gaussian has in any pixel of any of the views."""
     largest = torch.zeros(len(backbone))
     for view in views:
@@ -181,7 +181,8 @@ class Prune(Hook):
         self.streak = torch.where(sums.weight > 0, updated, self.streak)
         remove = within_light(self.streak >= config.patience, sums.weight, config.light)
         if self._looks_everywhere(context):
-            remove = remove | (largest_weights(context.backbone, context.known()) < config.unseen)
+            views = [*context.known(), *(view for view, _ in context.underway(context.known()))]
+            remove = remove | (largest_weights(context.backbone, views) < config.unseen)
         return Edit(remove=remove) if remove.any() else None
 
     def _looks_everywhere(self, context: Context) -> bool:
