@@ -25,9 +25,6 @@ FLOATS = 0.4
 LEAST_LIGHT = 2e-5
 """That light, as a share of all of the evaluation, below which a Gaussian is too small to be worth a hole."""
 
-STEPS_PER_VIEW = 4
-"""Steps for each training view that a run has had before what is seen nowhere goes."""
-
 
 @dataclass(frozen=True)
 class PruneConfig(HookConfig):
@@ -189,7 +186,7 @@ class Prune(Hook):
         """Whether this is the first evaluation after scores have ended, of a run that has shown each view often."""
         end = self.config.score_stop
         first = end is not None and 0 <= context.step - end < self.config.every
-        return first and self.config.unseen > 0 and 0 < STEPS_PER_VIEW * len(context.known()) <= context.step
+        return first and self.config.unseen > 0 and 0 < 4 * len(context.known()) <= context.step
 
     def follow(self, index: Tensor) -> None:
         """Streaks move with their Gaussians; new ones start at 0."""
