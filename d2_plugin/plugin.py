@@ -283,14 +283,14 @@ class D2Hooks:
 
     def _context(self, step: int, views: Sequence) -> Context:
         def sample() -> Sequence:
-            first = 0 if self._evaluated else len({view.camera for view in self._sampler.known()})
+            first = 0 if self._evaluated else self._sampler.cameras
             self._evaluated = True
             return self._sampler.sample(max(self.config.views_per_evaluation, first), self.generator)
 
         assert self.prior is not None, "a step without hooks has no context"
-        known, motion = self._sampler.known, self.config.motion
+        instants, motion = self._sampler.instants, self.config.motion
         halfway = motion is not None and motion.insert
-        return Context(step, self.backbone, views, self.prior, self.generator, sample, known, halfway)
+        return Context(step, self.backbone, views, self.prior, self.generator, sample, instants, halfway)
 
     def _retire_if_idle(self, step: int, name: str, edit: Edit | None, context: Context) -> None:
         if name not in HOOKS or not HOOKS[name].edits_structure or not context.evaluation:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, NamedTuple, TypeVar
@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from d2_plugin.hooks.expected import check_device, check_splats
-from d2_plugin.hooks.prior import Kept, PriorLoader
+from d2_plugin.hooks.prior import PriorLoader
 from d2_plugin.protocol import Backbone, DepthPrior, Edit, Splats, Survey, View
 from d2_plugin.rasterizer import survey
 from d2_plugin.settings import Every, Settings, Steps
@@ -63,6 +63,10 @@ def steps_between_evaluations(iterations: int, least: int) -> int:
     return max(least, min(100, iterations // 20))
 
 
+def _none_known(_: str) -> Sequence[View]:
+    return ()
+
+
 class Surveyed(NamedTuple):
     """One view of an evaluation: its sliced Gaussians, its prior, and the compositing weights."""
 
@@ -84,14 +88,10 @@ class Context:
     generator: torch.Generator
     sample: Callable[[], Sequence[View]] = field(default=tuple)
     """The views to evaluate when structure is edited: a stratified sample of all training views."""
-    known: Callable[[], Collection[View]] = tuple
-    """All views that were trained on so far, in the order in which they were first seen."""
+    instants: Callable[[str], Sequence[View]] = _none_known
+    """The views of a camera that were trained on so far, in the order in which they were first seen."""
     inserts_halfway: bool = False
     """Whether `halfway` is evaluated as well."""
-
-    def instants(self, camera: str) -> list[View]:
-        """Those of one camera."""
-        return [view for view in self.known() if view.camera == camera]
 
     @cached_property
     def evaluation(self) -> list[Surveyed]:
@@ -99,16 +99,11 @@ class Context:
         pairs = [(view, self.prior(view)) for view in self.sample()]
         return [self._survey(view, prior) for view, prior in pairs if prior is not None]
 
-    def underway(self, views: Iterable[View]) -> list[tuple[View, Kept]]:
-        """What lies halfway from each view to the camera's next instant, where it is to be known."""
-        asked = views if self.inserts_halfway else ()
-        pairs = (self.prior.underway(view, self.instants(view.camera)) for view in asked)
-        return [pair for pair in pairs if pair is not None]
-
     @cached_property
     def halfway(self) -> list[Surveyed]:
-        """The same of the views of `evaluation`, surveyed."""
-        pairs = self.underway(surveyed.view for surveyed in self.evaluation)
+        """What lies halfway from each view of `evaluation` to the camera's next instant, where it is to be known."""
+        seen = [surveyed.view for surveyed in self.evaluation] if self.inserts_halfway else []
+        pairs = [pair for view in seen if (pair := self.prior.underway(view, self.instants(view.camera))) is not None]
         return [self._survey(view, self.prior.believed(kept.prior(view.K.device))) for view, kept in pairs]
 
     @torch.no_grad()

@@ -11,8 +11,7 @@ from torch import Tensor
 
 from d2_plugin.hooks.hook import Context, Hook, HookConfig, Surveyed, steps_between_evaluations
 from d2_plugin.hooks.rendered_depth import EPSILON
-from d2_plugin.protocol import Backbone, DepthPrior, Edit, View
-from d2_plugin.rasterizer import survey
+from d2_plugin.protocol import Edit
 from d2_plugin.settings import Every, Range, Share, Steps
 
 AT_LEAST = 10
@@ -35,9 +34,8 @@ class PruneConfig(HookConfig):
     stop: Steps | None = 3000
     """First step at which it no longer runs."""
     score_stop: Steps | None = 2000
-    """First step from which scores remove nothing more. What no view shows goes then, once, and until `stop` what
-    floats in free space, however opaque it is: the paper's score forgives that, and a camera that did not train may see
-    little else."""
+    """First step from which scores remove nothing more. Until `stop` what floats in free space goes, however opaque it
+    is: the paper's score forgives that, and a camera that did not train may see little else."""
     every: Every = 100
     """Steps between evaluations."""
     tau_u: Annotated[float, Range(1e-6, 1e6)] = 0.1
@@ -51,9 +49,6 @@ class PruneConfig(HookConfig):
     free_space: bool = True
     """Whether standing in space that the prior says is free counts as inconsistency too, and removes after
     `score_stop`; the paper has no such term."""
-    unseen: Share = 0.02
-    """Compositing weight that a Gaussian reaches in some pixel of some training view, or halfway to its next instant
-    where that is known, or goes at `score_stop`; 0: all stay, as in runs with less than four steps for each view."""
     light: Share = 0.05
     """Largest share of the light in the surveyed views that one evaluation takes away: the faintest go first, the rest
     waits with its evidence for the next. 1 sets no limit, as the paper. What a random start has in front of every
@@ -109,13 +104,13 @@ class Sums(NamedTuple):
 def gather(evaluation: Sequence[Surveyed], count: int, free_space: bool) -> Sums:
     """Sum the surveys of several views per Gaussian."""
     error, weight, maxima, observations, front = evaluation[0].survey.weight.new_zeros(5, count)
-    for _, splats, _, found in evaluation:
+    for _, splats, _, survey in evaluation:
         if free_space:
-            front.index_add_(0, splats.rows, found.front)
-        error.index_add_(0, splats.rows, found.error)
-        weight.index_add_(0, splats.rows, found.weight)
-        maxima.index_add_(0, splats.rows, found.max_weight)
-        observations.index_add_(0, splats.rows, (found.max_weight > 0).to(maxima))
+            front.index_add_(0, splats.rows, survey.front)
+        error.index_add_(0, splats.rows, survey.error)
+        weight.index_add_(0, splats.rows, survey.weight)
+        maxima.index_add_(0, splats.rows, survey.max_weight)
+        observations.index_add_(0, splats.rows, (survey.max_weight > 0).to(maxima))
     return Sums(error + front, weight + front, maxima, observations, front)
 
 
@@ -123,19 +118,6 @@ def floating(sums: Sums) -> Tensor:
     """Gaussians [N] whose light stands deep in free space, bool: whatever they contribute there hides a surface."""
     enough = sums.front > LEAST_LIGHT * sums.weight.sum(dtype=torch.float64)
     return enough & (sums.front > FLOATS * (sums.weight - sums.front))
-
-
-@torch.no_grad()
-def largest_weights(backbone: Backbone, views: Sequence[View]) -> Tensor:
-    """The largest compositing weight [N] that each Gaussian has in any pixel of any of the views."""
-    largest = torch.zeros(len(backbone))
-    for view in views:
-        splats = backbone.slice_at(view)
-        nothing = splats.means.new_zeros(view.height, view.width)
-        weights = survey(splats, view, DepthPrior(nothing, nothing.byte()), backbone.settings).max_weight
-        largest = largest.to(weights)
-        largest[splats.rows] = torch.maximum(largest[splats.rows], weights)
-    return largest
 
 
 def within_light(remove: Tensor, weight: Tensor, share: float) -> Tensor:
@@ -177,16 +159,7 @@ class Prune(Hook):
         updated = torch.where(high, self.streak + 1, torch.zeros_like(self.streak))
         self.streak = torch.where(sums.weight > 0, updated, self.streak)
         remove = within_light(self.streak >= config.patience, sums.weight, config.light)
-        if self._looks_everywhere(context):
-            views = [*context.known(), *(view for view, _ in context.underway(context.known()))]
-            remove = remove | (largest_weights(context.backbone, views) < config.unseen)
         return Edit(remove=remove) if remove.any() else None
-
-    def _looks_everywhere(self, context: Context) -> bool:
-        """Whether this is the first evaluation after scores have ended, of a run that has shown each view often."""
-        end = self.config.score_stop
-        first = end is not None and 0 <= context.step - end < self.config.every
-        return first and self.config.unseen > 0 and 0 < 4 * len(context.known()) <= context.step
 
     def follow(self, index: Tensor) -> None:
         """Streaks move with their Gaussians; new ones start at 0."""

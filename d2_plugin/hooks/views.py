@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
@@ -30,9 +30,14 @@ class ViewSampler:
             self._views[view.camera, view.frame] = view
         return new
 
-    def known(self) -> Collection[View]:
-        """The known views, in the order in which they were first seen."""
-        return self._views.values()
+    @property
+    def cameras(self) -> int:
+        """How many cameras have been seen so far."""
+        return len({camera for camera, _ in self._views})
+
+    def instants(self, camera: str) -> list[View]:
+        """The known views of one camera, in the order in which they were first seen."""
+        return [view for view in self._views.values() if view.camera == camera]
 
     def sample(self, count: int, generator: torch.Generator) -> Sequence[View]:
         """At most `count` different views; over several calls every known view comes once before any comes again."""

@@ -56,7 +56,10 @@ class Halfway(TinyStore):
 
 
 def context_of(adapter: object, store: object, views: list[View], known: list[View], step: int = 2) -> Context:
-    return Context(step, adapter, views, PriorLoader(store), torch.Generator(), tuple, lambda: known)
+    def of(camera: str) -> list[View]:
+        return [view for view in known if view.camera == camera]
+
+    return Context(step, adapter, views, PriorLoader(store), torch.Generator(), tuple, of)
 
 
 def loss_of(adapter: object, store: object | None = None, step: int = 2, **changes: float) -> Tensor | None:
@@ -232,11 +235,15 @@ class Crossing:
 
 def evaluation_of(store: Crossing, known: list[View], count: int = 1) -> Context:
     """What the hooks see at an evaluation once `known` was trained on."""
+
+    def of(camera: str) -> list[View]:
+        return [view for view in known if view.camera == camera]
+
     model = make_model(count=count)
     with torch.no_grad():
         model.gaussians["positions"][:, 2] = 50.0
     numbers = torch.Generator().manual_seed(0)
-    return Context(1, make_adapter(model), (), PriorLoader(store), numbers, lambda: known[:1], lambda: known)
+    return Context(1, make_adapter(model), (), PriorLoader(store), numbers, lambda: known[:1], of)
 
 
 def bar(frame: int) -> Tensor:

@@ -213,43 +213,6 @@ def test_what_is_opaque_in_free_space_goes_once_scores_have_ended() -> None:
     assert gone(replace(floats, stop=5), cast(view)) == FLOATING, "faint ones as well"
 
 
-SHOWN = {0.0: [0, 1, 2], 0.5: [4], 1.0: [0, 1, 2, 3]}
-"""Which Gaussians there are at two instants and halfway: one in plain sight, one hidden behind it, one behind the
-camera, one that the second instant shows, and one that is there halfway alone."""
-
-
-class Appearing(Fixed):
-    def slice_at(self, view: View) -> Splats:
-        rows = torch.tensor(SHOWN[view.time])
-        means, covariances, opacities, _ = (part[rows] for part in self.splats)
-        return Splats(means, covariances, opacities, rows)
-
-
-def test_what_no_view_shows_goes_once_scores_have_ended() -> None:
-    first = replace(make_views()[0], frame=0, time=0.0)
-    views = [first, replace(first, frame=1, time=1.0)]
-    means = torch.tensor([[0.0, 0, 2], [0, 0, 3], [0, 0, -5], [0.5, 0, 2], [0.5, 0, 2]])
-    round_ones = 0.01 * torch.tensor([1.0, 0, 0, 1, 0, 1]).repeat(5, 1)
-    splats = Splats(means, round_ones, torch.tensor([0.99, 0.02, 0.9, 0.9, 0.9]), torch.arange(5))
-    store = SimpleNamespace(
-        prior=lambda camera, frame: bands(),
-        underway=lambda camera, frame, quarter: (1, bands()) if frame == 0 else None,
-    )
-
-    def gone(step: int, rounds: int = 1, halfway: bool = True, **settings: float) -> list[int]:
-        known = views * rounds
-        config, numbers = PruneConfig(every=10, score_stop=20, **settings), torch.Generator()
-        sample, backbone = lambda: views[:1], Appearing(splats)
-        found = Context(step, backbone, [], PriorLoader(store), numbers, sample, lambda: known, halfway)
-        edit = Prune(config).edit(found)
-        return [] if edit is None else torch.nonzero(edit.remove).squeeze(1).tolist()
-
-    assert gone(20) == gone(29) == [1, 2]
-    assert gone(20, halfway=False) == [1, 2, 4], "who trains nothing halfway needs nothing there"
-    assert gone(19) == gone(30) == gone(20, unseen=0) == [], "once, and not where it is switched off"
-    assert gone(20, rounds=3) == [], "each view was shown three times at most"
-
-
 def test_what_is_too_small_to_see_is_no_floater() -> None:
     """The same Gaussian, deep in free space, beside much light of others and beside less."""
 
