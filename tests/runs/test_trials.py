@@ -119,7 +119,7 @@ def test_depth_that_is_right_is_believed_and_depth_that_is_not_is_not_whatever_i
 
 def test_the_user_may_choose_and_then_nothing_is_tried(room: Path, tmp_path: Path) -> None:
     cameras = tuple(open_recording(room).cameras)[:CAMERAS]
-    settings = RunSettings(str(room), cameras, iterations=1000)
+    settings = RunSettings(str(room), cameras, iterations=300)
     scene = Run(settings, tmp_path / "run").scene
     both = scene.plan.with_decision(Decision("stereo", True, "told")).measured
     scene = replace(scene, plan=replace(scene.plan, measured=both, mono_source="maps", mono_kind="relative"))
@@ -128,7 +128,7 @@ def test_the_user_may_choose_and_then_nothing_is_tried(room: Path, tmp_path: Pat
         {"overrides": {"d2": {"believe": "all"}}},
         {"overrides": {"priors": {"variant": "mvs"}}},
         {"hooks": ("prior",)},
-        {"iterations": 999},
+        {"iterations": 299},
     ):
         assert not is_open(replace(settings, **changes), scene), changes
     assert not is_open(settings, replace(scene, train_cameras=cameras[:2])), "one camera would train alone"

@@ -44,7 +44,7 @@ from d2_plugin.runs.start import (
 )
 from d2_plugin.store.store import PriorStore
 
-LEAST_ITERATIONS = 1000
+LEAST_ITERATIONS = 300
 """Of a run that is worth trials; a shorter one uses the whole prior."""
 LEAST_CAMERAS = 3
 """Without one of two cameras, one would train alone: that shows nothing of what two show."""
