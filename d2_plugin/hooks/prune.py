@@ -31,11 +31,12 @@ class PruneConfig(HookConfig):
 
     start: Steps = 300
     """First step at which it may run."""
-    stop: Steps | None = 3000
+    stop: Steps | None = 2000
     """First step at which it no longer runs."""
-    score_stop: Steps | None = 2000
-    """First step from which scores remove nothing more. Until `stop` what floats in free space goes, however opaque it
-    is: the paper's score forgives that, and a camera that did not train may see little else."""
+    score_stop: Steps | None = None
+    """First step from which scores remove nothing more; none: they go on to `stop`. From then on what floats in free
+    space goes, however opaque it is: the paper's score forgives that, and a camera that did not train may see little
+    else."""
     every: Every = 100
     """Steps between evaluations."""
     tau_u: Annotated[float, Range(1e-6, 1e6)] = 0.1

@@ -8,6 +8,7 @@ decoded once, and its frames are counted.
 from __future__ import annotations
 
 import logging
+from bisect import bisect_right
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -213,7 +214,8 @@ def videos_below(folder: Path) -> tuple[Path, ...]:
 
 def decoded_alone(video: VideoFile, index: int) -> int:
     """The last frame up to `index` that needs no other one, where the container knows it."""
-    return max((key for key in video.keys if key <= index), default=index)
+    place = bisect_right(video.keys, index)
+    return video.keys[place - 1] if place else index
 
 
 class Decoder:

@@ -156,7 +156,7 @@ def _turns(
         tried = {}
         for name in {name: None for pair in matches for name in pair if name not in turns}:
             trials = [turned(name, cameras, _places(half, features)) for half in (*halves, matches)]
-            own = [_of(name, half) for half in halves]
+            own = [_matches_of(name, half) for half in halves]
             before = [_squares(cameras, half, features) for half in own]
             after = [_squares({**cameras, name: trials[1 - i]}, half, features) for i, half in enumerate(own)]
             falls = all(new.sum() < FALLS_TO**2 * old.sum() for new, old in zip(after, before, strict=True))
@@ -179,13 +179,13 @@ def _places(matches: Matches, features: Mapping[str, Features]) -> Matched:
     }
 
 
-def _of(name: str, matches: Matches) -> Matches:
+def _matches_of(name: str, matches: Matches) -> Matches:
     """The matches of one camera: what pairs of others miss would hide what it does."""
     return {pair: pairs for pair, pairs in matches.items() if name in pair}
 
 
 def _misses(name: str, cameras: Mapping[str, Camera], matches: Matches, features: Mapping[str, Features]) -> float:
-    own = _places(_of(name, matches), features)
+    own = _places(_matches_of(name, matches), features)
     return float(
         np.median(np.abs(np.concatenate([sampson(cameras[a], cameras[b], *ends) for (a, b), ends in own.items()])))
     )
