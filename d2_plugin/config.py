@@ -43,9 +43,9 @@ class D2Config(_HookTables):
 
     prior: str | None = None
     """Folder of the depth prior, as `d2 priors` writes it."""
-    believe: Belief = "all"
-    """What of the prior is used: all of it, stereo alone, or nothing. Where it is not set, `d2 train` tries it out on
-    training cameras that it leaves out for a moment."""
+    believe: Belief | None = None
+    """What of the prior is used: all of it, stereo alone, or nothing. None: what trials with a left-out training camera
+    showed of this prior, which `d2 priors` and `d2 train` make; all of it where there were none."""
     exported: str | None = None
     """Folder that `d2 export-recording` wrote and the trainer reads, where the prior is that of the source: its cameras
     and frames have other names there. Found without this where the trainer's cameras know the paths of their images.

@@ -41,6 +41,7 @@ def run(given: Given) -> str:
     from d2_plugin.priors.declared_error import frames_with_truth, held_against_truth
     from d2_plugin.priors.sheet import contact_sheet
     from d2_plugin.runs.prior.build import build_priors_for
+    from d2_plugin.runs.prior.trials import can_decide, tried
     from d2_plugin.runs.scene import Scene
     from d2_plugin.runs.settings import check
     from d2_plugin.runs.start import triangulated_points
@@ -52,8 +53,8 @@ def run(given: Given) -> str:
     scene = Scene.open(settings)
     show_notes(scene.recording.notes)
     show_plan(scene.plan)
-    points = triangulated_points(scene.recording, scene.train_cameras).positions
-    summary = build_priors_for(scene, points, options.output, shard=shard, cluster=cluster)
+    points = triangulated_points(scene.recording, scene.train_cameras)
+    summary = build_priors_for(scene, points.positions, options.output, shard=shard, cluster=cluster)
     show(str(summary), summary.headline())
     folder = summary.folder or options.output
     if folder != options.output:
@@ -65,6 +66,8 @@ def run(given: Given) -> str:
     calibration = held_against_truth(store, scene.recording, frames)
     if calibration is not None:
         show(str(calibration))
+    if summary.usable and can_decide(scene):
+        show(str(tried(settings, scene, points, folder)))
     try:
         with in_turn(options.output):
             contact_sheet(store, scene.recording, sheet)

@@ -63,7 +63,7 @@ def run(given: Given) -> str:
     live = _live(run) if options.view else None
     run.train(on_prior=lambda summary: show(str(summary)), watch=None if live is None else live.watch)
     if run.trials is not None:
-        show(str(run.trials))
+        show(run.trials["text"])
     show_notes([f"{name} retired at step {step}: it changed next to nothing" for name, step in run.retired.items()])
     metrics = run.evaluate()
     if metrics["background"]:

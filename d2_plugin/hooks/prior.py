@@ -27,6 +27,7 @@ class Store(Protocol):
 
     Where it also has `camera(camera, frame) -> CameraRecord | None`, views are checked against it. Where it has
     `underway(camera, frame, quarter) -> (next frame, DepthPrior) | None`, instants between the trained ones are known.
+    Where it has `tried() -> {"choice", "text"} | None`, that says what of it is worth inserting.
     Where it has `coded` and `coded_underway`, their `CodedPrior` is kept in memory in the place of the prior.
     """
 
@@ -226,12 +227,17 @@ class PriorLoader:
     """
 
     def __init__(
-        self, store: Store, memory_mb: int = 2048, rename: Rename | None = None, believe: Belief = "all"
+        self, store: Store, memory_mb: int = 2048, rename: Rename | None = None, believe: Belief | None = None
     ) -> None:
-        """`memory_mb`: what the priors that are kept may take; the one in use is kept whatever it takes."""
+        """`memory_mb`: what the priors that are kept may take; the one in use is kept whatever it takes. `believe`:
+        None for what trials with this prior showed."""
         if isinstance(store, type) or not callable(getattr(store, "prior", None)):
             raise D2Error(f"the store is a {type(store).__name__} without prior(camera, frame): give one that has it")
-        self.store, self.keep_bytes, self._rename, self.believe = store, memory_mb << 20, rename, believe
+        self.store, self.keep_bytes, self._rename = store, memory_mb << 20, rename
+        tried = None if believe else call_optional(store, "tried")
+        self.believe: Belief = believe or ("all" if tried is None else tried["choice"])
+        self.verdict: str = "" if tried is None else tried["text"]
+        """What the trials showed, in words."""
         # By camera and frame; frame + 0.5 is halfway to the next.
         self._kept: OrderedDict[tuple[str, float], Kept | None] = OrderedDict()
         self._next: dict[tuple[str, float], tuple[int, torch.Size, tuple[slice, slice] | None]] = {}

@@ -97,6 +97,8 @@ class RunLog:
             "attached by %s to %d Gaussians; priors of cameras %s; %s",
             type(backbone).__name__, len(backbone), cameras or "unknown", schedules,
         )  # fmt: skip
+        if prior is not None and prior.verdict:
+            log.info("%s", prior.verdict)
         if iterations is None:
             self._warn_of_default_schedules()
         else:

@@ -18,7 +18,7 @@ from d2_plugin.plugin import D2Hooks
 from d2_plugin.priors.summary import PriorSummary
 from d2_plugin.progress import progress_bar
 from d2_plugin.runs.prior.build import build_priors_for, refuse_unusable
-from d2_plugin.runs.prior.trials import Trials, is_open, kept_trials
+from d2_plugin.runs.prior.trials import LEAST_ITERATIONS, can_decide, tried
 from d2_plugin.runs.rows import circumstances
 from d2_plugin.runs.saved import (
     METRICS,
@@ -81,6 +81,8 @@ class Run:
         """Hooks that stopped because they changed next to nothing, and at which step."""
         self.prior: dict[str, Any] | None = None
         """What the depth prior became, as `PriorSummary.as_dict` has it; None without one."""
+        self.trials: dict[str, Any] | None = None
+        """What trials showed of it, as `Trials.as_dict` has it; None where nothing was tried."""
         self._writes = False
 
     @classmethod
@@ -114,7 +116,19 @@ class Run:
                     on_prior(summary)
                 refuse_unusable(summary, self.settings.accept_empty_prior)
                 self.prior = summary.as_dict()
+                self.trials = self._tried(points)
         return points
+
+    def _tried(self, points: TimedPoints) -> dict[str, Any] | None:
+        """What trials showed of the prior, where that is left to them; a short run makes none."""
+        settings = self.settings
+        inserts = bool({"densify", "depth_loss"} & set(settings.hooks))
+        chosen = "believe" in settings.overrides.get("d2", {})
+        if self.guidance is not None or chosen or not inserts or not can_decide(self.scene):
+            return None
+        if settings.iterations < LEAST_ITERATIONS:
+            return PriorStore.described(self.priors).tried()
+        return tried(settings, self.scene, points, self.priors).as_dict()
 
     def train(self, on_prior: Callable[[PriorSummary], None] | None = None, watch: Watch | None = None) -> None:
         """Build what is missing, then train to the last iteration, continuing from a checkpoint if there is one.
@@ -127,9 +141,6 @@ class Run:
         """
         with self._writing():
             points = self.prepare(on_prior)
-            if self.guidance is None and is_open(self.settings, self.scene):
-                with self._timed("priors"):
-                    kept_trials(self.folder / "trials.json", self.settings, self.scene, points, self.priors)
             trainer = self._trainer(points)
             self._restore(trainer)
             watching = watch(trainer) if watch else lambda step, loss: None
@@ -164,12 +175,6 @@ class Run:
             metrics = scores | _about(self, trainer)
             write_table(self.folder / "metrics.json", metrics, METRICS)
         return metrics
-
-    @property
-    def trials(self) -> Trials | None:
-        """What left-out training cameras showed of the prior, from trials.json; None where nothing was tried."""
-        path = self.folder / "trials.json"
-        return Trials.load(path) if path.is_file() else None
 
     @property
     def priors(self) -> Path:
@@ -222,15 +227,15 @@ class Run:
     def _attach(self, model: object) -> D2Hooks:
         adapter: Any = registry.load(registry.ADAPTERS, self.settings.backbone)
         config = hook_config(self.settings, self.priors)
-        trials = self.trials
-        config = config if trials is None else replace(config, believe=trials.choice)
+        config = config if self.trials is None else replace(config, believe=self.trials["choice"])
         write_text(self.folder / "d2.toml", config.to_toml())
         guidance, priors = self.guidance, self.priors
         others = {} if guidance is None else guidance.hooks(self.scene, self._points(), priors)
         return D2Hooks(config, adapter(model), hooks=others)
 
     def _save(self, trainer: Any) -> None:
-        used = {"seconds": dict(self.seconds), "cpu_seconds": dict(self.cpu_seconds), "prior": self.prior}
+        used: dict[str, Any] = {"seconds": dict(self.seconds), "cpu_seconds": dict(self.cpu_seconds)}
+        used |= {"prior": self.prior, "trials": self.trials}
         save_checkpoint(self._checkpoint, trainer.state_dict() | used)
 
     def _restore(self, trainer: Any) -> bool:
@@ -245,7 +250,7 @@ class Run:
             self.seconds = {name: max(value, self.seconds[name]) for name, value in state["seconds"].items()}
             kept = state["cpu_seconds"]
             self.cpu_seconds = {name: max(value, kept[name]) for name, value in self.cpu_seconds.items()}
-            self.prior = self.prior or state["prior"]
+            self.prior, self.trials = self.prior or state["prior"], self.trials or state["trials"]
         wrong = what_diverged(trainer.model)
         if wrong:
             raise D2Error(f"the model in {self._checkpoint} diverged before step {trainer.step} ({wrong}): train anew")
@@ -294,7 +299,7 @@ def _about(run: Run, trainer: Any) -> dict[str, Any]:
         "background": getattr(trainer.model, "background", None) is not None,
         "appearance": getattr(trainer.model, "appearance", None) is not None,
         "prior": run.prior,
-        "trials": None if run.trials is None else run.trials.as_dict(),
+        "trials": run.trials,
         "plan": scene.plan.as_dict(),
         "recording": scene.recording.name,
         "mono_emulated": scene.recording.mono_emulated or "(emulated)" in scene.plan.multiview,

@@ -10,6 +10,7 @@ from typing import Any
 
 from d2_plugin.durable import Kind, make_folder, read_table, write_table
 from d2_plugin.runs.prior.build import build_priors_for
+from d2_plugin.runs.prior.trials import can_decide, tried
 from d2_plugin.runs.scene import Scene
 from d2_plugin.runs.settings import HOOK_NAMES, RunSettings, check, prior_settings
 from d2_plugin.runs.start import TimedPoints, triangulated_points
@@ -54,7 +55,7 @@ def share_points(settings: RunSettings, folder: Path) -> Path:
 
 
 def share(settings: RunSettings, folder: Path, cluster: Mapping[str, Any] | None = None) -> Shared:
-    """Make what is missing in `folder`: points.npz and priors/VARIANT.
+    """Make what is missing in `folder`: points.npz and priors/VARIANT, with the trials of what of it helps.
 
     Args:
         settings: of any run of the comparison that uses this variant of the prior.
@@ -63,10 +64,14 @@ def share(settings: RunSettings, folder: Path, cluster: Mapping[str, Any] | None
     shared = Shared(folder, prior_settings(settings).variant)
     points = share_points(settings, folder)
     if not _record(shared.priors).is_file():
-        scene = Scene.open(check(replace(settings, hooks=HOOK_NAMES)))
-        positions = TimedPoints.load(points).positions
-        clock = time.process_time if cluster is None else time.monotonic
-        _timed(shared.priors, lambda: build_priors_for(scene, positions, shared.priors, cluster=cluster), clock)
+        scene, known = Scene.open(check(replace(settings, hooks=HOOK_NAMES))), TimedPoints.load(points)
+
+        def make() -> None:
+            summary = build_priors_for(scene, known.positions, shared.priors, cluster=cluster)
+            if summary.usable and can_decide(scene):
+                tried(settings, scene, known, shared.priors)
+
+        _timed(shared.priors, make, time.process_time if cluster is None else time.monotonic)
     return shared
 
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from d2_plugin.errors import refuse_unknown
-from d2_plugin.protocol import EXPORT_FILE, DepthPrior
+from d2_plugin.protocol import EXPORT_FILE, DepthPrior, call_optional
 from d2_plugin.reading import field, parsing, read_json
 from d2_plugin.store.store import PriorStore
 from d2_plugin.values import fitting
@@ -47,6 +47,11 @@ class RenamedStore:
         """Names, in the export, of the cameras that have priors."""
         known = getattr(self.store, "cameras", None)
         return tuple(name for name, source in self.sources.items() if known is None or source in known)
+
+    def tried(self) -> dict[str, Any] | None:
+        """See `PriorStore.tried`."""
+        found: dict[str, Any] | None = call_optional(self.store, "tried")
+        return found
 
     def prior(self, camera: str, frame: int) -> DepthPrior | None:
         """D* of one view, or None where there is none; a camera that the export does not have is refused."""

@@ -6,6 +6,7 @@
     STORE/priors/CAMERA/FRAME.json       record: a, b, gap, status, shares, settings, hashes, depth range, checksum
     STORE/between/QUARTER/CAMERA/FRAME.npy, .json  the same 1 to 3 quarters of the way from a frame to the next one
                                          (`d2_plugin.priors.between`)
+    STORE/trials.json                    what of these priors is worth inserting (`d2_plugin.runs.prior.trials`)
     STORE/cache/...                      stereo and monocular maps, so that other fusion settings cost seconds
     STORE/cameras/NAME+NAME/...          a store of its own for the priors of other cameras of the same recording
 
@@ -50,6 +51,9 @@ FORMAT = 4
 
 STORE = Kind("prior store", FORMAT, "build the priors anew in another folder")
 """The table store.json."""
+
+TRIALS = Kind("table of trials", 1, "delete the file, `d2 priors` makes it again")
+"""The table trials.json."""
 
 QUARTERS = (1, 2, 3)
 """Of the way from a frame to the next one, at which something is known between them."""
@@ -196,6 +200,21 @@ class PriorStore:
         """What is known about one prior: alignment, shares, settings, hashes; None where the store has none."""
         entry = self._entry(camera, frame)
         return None if entry is None else entry.record
+
+    @property
+    def contents(self) -> str:
+        """Hash of what all these priors were built from."""
+        return hash_of(
+            [(self.record(camera, frame) or {}).get("key") for camera in self.cameras for frame in self.frames]
+        )
+
+    def tried(self) -> dict[str, Any] | None:
+        """What trials with these very priors showed, as `Trials.as_dict` has it; None where there were none."""
+        try:
+            table = read_table(self.path / "trials.json", TRIALS)
+        except FileNotFoundError:
+            return None
+        return table if table["contents"] == self.contents else None
 
     def camera(self, camera: str, frame: int) -> CameraRecord | None:
         """The camera that one prior was built for; None where the store has none or does not say."""

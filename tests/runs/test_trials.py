@@ -10,14 +10,15 @@ import pytest
 import torch
 
 from d2_plugin.config import D2Config
-from d2_plugin.hooks.prior import believed
+from d2_plugin.hooks.prior import PriorLoader, believed
 from d2_plugin.priors.fuse import FusedPrior
+from d2_plugin.priors.summary import PriorSummary
 from d2_plugin.protocol import DepthPrior, Label
 from d2_plugin.recordings import Recording, open_recording
 from d2_plugin.recordings.export.folder import save_recording
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.runs.plan import Decision
-from d2_plugin.runs.prior.trials import Score, Trials, is_open, leave_out_in_turn, left_out, small_prior
+from d2_plugin.runs.prior.trials import Score, Trials, can_decide, leave_out_in_turn, left_out, small_prior
 from d2_plugin.runs.run import Run
 from d2_plugin.runs.settings import RunSettings
 from d2_plugin.runs.start import TimedPoints
@@ -68,13 +69,12 @@ def test_a_small_image_gets_the_depth_of_the_middle_of_its_pixels_and_their_mean
     torch.testing.assert_close(small.colors[0, :, 0].float(), means, atol=0.5, rtol=0)
 
 
-def test_ssim_at_left_out_cameras_decides_and_one_line_says_so(tmp_path: Path) -> None:
+def test_ssim_at_left_out_cameras_decides_and_one_line_says_so() -> None:
     helps, harms = Trials({"a": GOOD}, {"a": BAD}, 1.0), Trials({"a": BAD}, {"a": GOOD}, 1.0)
     assert (helps.choice, harms.choice) == ("all", "stereo")
     assert "stereo alone is used (left-out cameras: SSIM 0.700 with it, 0.800 without)" in str(harms)
     assert "the whole prior is used" in str(helps)
-    harms.save(tmp_path / "trials.json")
-    assert Trials.load(tmp_path / "trials.json") == harms
+    assert Trials.from_dict(harms.as_dict()) == harms
 
 
 @pytest.mark.parametrize(("cameras", "chosen"), [("ab", "ab"), ("abc", "ac"), ("abcd", "bd"), ("abcdefgh", "cg")])
@@ -117,47 +117,95 @@ def test_depth_that_is_right_is_believed_and_depth_that_is_not_is_not_whatever_i
     assert leave_out_in_turn(settings, scene, NO_POINTS, store).choice == choice
 
 
-def test_the_user_may_choose_and_then_nothing_is_tried(room: Path, tmp_path: Path) -> None:
-    cameras = tuple(open_recording(room).cameras)[:CAMERAS]
-    settings = RunSettings(str(room), cameras, iterations=300)
-    scene = Run(settings, tmp_path / "run").scene
-    both = scene.plan.with_decision(Decision("stereo", True, "told")).measured
-    scene = replace(scene, plan=replace(scene.plan, measured=both, mono_source="maps", mono_kind="relative"))
-    assert is_open(settings, scene)
-    for changes in (
-        {"overrides": {"d2": {"believe": "all"}}},
-        {"overrides": {"priors": {"variant": "mvs"}}},
-        {"hooks": ("prior",)},
-        {"iterations": 299},
-    ):
-        assert not is_open(replace(settings, **changes), scene), changes
-    assert not is_open(settings, replace(scene, train_cameras=cameras[:2])), "one camera would train alone"
+def with_both_sources(run: Run) -> None:
+    """Give the plan a matched and a monocular depth."""
+    both = run.scene.plan.with_decision(Decision("stereo", True, "told")).measured
+    plan = replace(run.scene.plan, measured=both, mono_source="maps", mono_kind="relative")
+    run.scene = replace(run.scene, plan=plan)
 
 
-def test_a_run_that_is_continued_does_not_try_again_and_its_hooks_get_the_choice(
-    room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    cameras = tuple(open_recording(room).cameras)[:CAMERAS]
-    tried = []
+@pytest.fixture
+def tried(monkeypatch: pytest.MonkeyPatch) -> list[RunSettings]:
+    """Trials that take no time and find the network of no use; the settings that they were made with."""
+    made: list[RunSettings] = []
 
-    def told(*_: object) -> Trials:
-        tried.append(1)
+    def told(settings: RunSettings, *_: object) -> Trials:
+        made.append(settings)
         return Trials({"a": BAD}, {"a": GOOD}, 1.0)
 
     monkeypatch.setattr("d2_plugin.runs.prior.trials.leave_out_in_turn", told)
-    monkeypatch.setattr("d2_plugin.runs.run.is_open", lambda *_: True)
+    summary = PriorSummary(views={("a", 0): {"shares": {"verified": 1.0}, "sigmas": {}, "refused": None}})
+    monkeypatch.setattr("d2_plugin.runs.run.build_priors_for", lambda *_, **__: summary)
+    return made
+
+
+def test_the_user_may_choose_and_then_nothing_is_tried(room: Path, tmp_path: Path, tried: list[RunSettings]) -> None:
+    cameras = tuple(open_recording(room).cameras)[:CAMERAS]
+    priors = str(stored(tmp_path / "priors", open_recording(room), cameras, 0.0))
+    settings = RunSettings(str(room), cameras, iterations=300, priors=priors)
+    for number, changes in enumerate(
+        (
+            {"overrides": {"d2": {"believe": "all"}}},
+            {"overrides": {"priors": {"variant": "mvs"}}},
+            {"hooks": ("prior",)},
+            {"iterations": 299},
+        )
+    ):
+        run = Run(replace(settings, **changes), tmp_path / str(number))
+        with_both_sources(run)
+        run.prepare()
+        assert run.trials is None, changes
+    assert not tried
+
+
+def test_one_of_two_cameras_would_train_alone_so_two_cameras_get_no_trial(room: Path, tmp_path: Path) -> None:
+    cameras = tuple(open_recording(room).cameras)[:CAMERAS]
+    run = Run(RunSettings(str(room), cameras), tmp_path / "run")
+    with_both_sources(run)
+    assert can_decide(run.scene)
+    assert not can_decide(replace(run.scene, train_cameras=cameras[:2]))
+
+
+def test_what_one_run_tried_serves_every_trainer_with_that_prior_until_the_prior_changes(
+    room: Path, tmp_path: Path, tried: list[RunSettings]
+) -> None:
     recording = open_recording(room)
+    cameras = tuple(recording.cameras)[:CAMERAS]
     priors = stored(tmp_path / "priors", recording, cameras, 0.0)
-    monkeypatch.setattr(Run, "prepare", lambda run, *_: run._points())
-    settings = RunSettings(str(room), cameras, iterations=3, priors=str(priors))
-    for _ in range(2):
-        run = Run(settings, tmp_path / "run")
-        run.train()
+    settings = RunSettings(str(room), cameras, iterations=300, priors=str(priors), seed=3, backbone="deform")
+    for number, run_settings in enumerate((settings, replace(settings, iterations=3))):
+        run = Run(run_settings, tmp_path / str(number))
+        with_both_sources(run)
+        run.prepare()
         assert run.trials is not None
-        assert run.trials.choice == "stereo"
-    assert tried == [1]
-    reopened = Run(settings, tmp_path / "run")
-    assert reopened.evaluate(images=False)["trials"]["choice"] == "stereo", "scored again, the run still says so"
+        assert run.trials["choice"] == "stereo"
+    assert [(one.seed, one.backbone) for one in tried] == [(0, "yang4d")]
+    store = PriorStore.open(priors)
+    assert PriorLoader(store).believe == "stereo"
+    assert "of no use" in PriorLoader(store).verdict
+    assert PriorLoader(store, believe="all").believe == "all", "the user's own word stands"
+    maps = (np.zeros((HEIGHT, WIDTH), kind) for kind in (np.float32, np.uint8, np.float32))
+    empty = FusedPrior(*maps, recording.image(cameras[0], recording.frames[0]))
+    store.write(cameras[0], recording.frames[0], empty, {"key": "another", "shares": empty.shares()})
+    assert PriorLoader(PriorStore.open(priors)).believe == "all", "of another prior nothing is known"
+
+
+def test_a_run_that_is_scored_again_still_says_what_was_tried(
+    room: Path, tmp_path: Path, tried: list[RunSettings]
+) -> None:
+    recording = open_recording(room)
+    cameras = tuple(recording.cameras)[:CAMERAS]
+    priors = stored(tmp_path / "priors", recording, cameras, 0.0)
+    settings = RunSettings(str(room), cameras, iterations=3, priors=str(priors))
+    longer = Run(replace(settings, iterations=300), tmp_path / "longer")
+    with_both_sources(longer)
+    longer.prepare()
+    run = Run(settings, tmp_path / "run")
+    with_both_sources(run)
+    run.train()
+    (priors / "trials.json").unlink()
+    metrics = Run(settings, tmp_path / "run").evaluate(images=False)
+    assert metrics["trials"]["choice"] == "stereo"
     assert D2Config.from_toml(tmp_path / "run" / "d2.toml").believe == "stereo"
 
 

@@ -12,6 +12,7 @@ for both beliefs alike.
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -25,7 +26,7 @@ from torch import Tensor
 
 from d2_plugin import registry
 from d2_plugin.config import D2Config
-from d2_plugin.durable import Kind, read_table, write_table
+from d2_plugin.durable import CannotWrite, write_table
 from d2_plugin.hooks.prior import Belief, Store
 from d2_plugin.plugin import D2Hooks
 from d2_plugin.progress import progress_bar
@@ -33,7 +34,7 @@ from d2_plugin.protocol import DepthPrior
 from d2_plugin.recordings import Recording, open_recording
 from d2_plugin.runs.metrics import psnr, ssim_range1
 from d2_plugin.runs.scene import Scene
-from d2_plugin.runs.settings import RunSettings, hook_config, prior_settings
+from d2_plugin.runs.settings import HOOK_NAMES, RunSettings, hook_config
 from d2_plugin.runs.start import (
     TimedPoints,
     TrainingFrames,
@@ -42,10 +43,10 @@ from d2_plugin.runs.start import (
     make_view,
     scene_extent,
 )
-from d2_plugin.store.store import PriorStore
+from d2_plugin.store.store import TRIALS, PriorStore
 
 LEAST_ITERATIONS = 300
-"""Of a run that is worth trials; a shorter one uses the whole prior."""
+"""Of a run that makes trials; a shorter one would take less time than they, and only knows what was tried before."""
 LEAST_CAMERAS = 3
 """Without one of two cameras, one would train alone: that shows nothing of what two show."""
 STEPS = 200
@@ -60,9 +61,6 @@ MOST_LEFT_OUT = 2
 """Cameras that are left out, spread evenly in the order in which they are named."""
 CLEAR = 0.01
 """A difference of SSIM at one left-out camera that needs no second one."""
-
-TRIALS = Kind("table of trials", 1, "delete the file, the trials will be run again")
-"""trials.json."""
 
 
 class Score(NamedTuple):
@@ -94,21 +92,16 @@ class Trials:
         return f"here monocular depth {verdict} (left-out cameras: SSIM {with_it:.3f} with it, {without:.3f} without)"
 
     def as_dict(self) -> dict[str, Any]:
-        """For trials.json and metrics.json."""
+        """For the table beside the prior and for metrics.json."""
         scores = {
             name: {camera: score._asdict() for camera, score in found.items()}
             for name, found in (("all", self.everything), ("stereo", self.stereo))
         }
         return {"choice": self.choice, "text": str(self), "cpu_seconds": self.cpu_seconds, "scores": scores}
 
-    def save(self, path: Path) -> None:
-        """Write them, so that a run that is continued need not try again."""
-        write_table(path, self.as_dict(), TRIALS)
-
     @classmethod
-    def load(cls, path: Path) -> Trials:
-        """What `save` wrote."""
-        table = read_table(path, TRIALS)
+    def from_dict(cls, table: Mapping[str, Any]) -> Trials:
+        """From what `as_dict` made."""
         scores = {
             name: {camera: Score(**score) for camera, score in found.items()} for name, found in table["scores"].items()
         }
@@ -119,24 +112,30 @@ def _mean_ssim(scores: Mapping[str, Score]) -> float:
     return float(np.mean([score.ssim for score in scores.values()]))
 
 
-def is_open(settings: RunSettings, scene: Scene) -> bool:
-    """Whether trials can decide: two depth sources, three cameras, a run long enough, and no choice of the user's."""
-    if settings.iterations < LEAST_ITERATIONS:
-        return False
-    chosen = "believe" in settings.overrides.get("d2", {})
-    uses_depth = bool({"densify", "depth_loss"} & set(settings.hooks))
-    both = scene.plan.uses("verification") and prior_settings(settings).variant == "dual"
-    return both and uses_depth and not chosen and len(scene.train_cameras) >= LEAST_CAMERAS
+def can_decide(scene: Scene) -> bool:
+    """Whether trials can say anything: two depth sources that both insert, and three cameras."""
+    both = scene.plan.uses("verification") and scene.prior_settings.variant == "dual"
+    return both and len(scene.train_cameras) >= LEAST_CAMERAS
 
 
-def kept_trials(path: Path, settings: RunSettings, scene: Scene, points: TimedPoints, priors: Path) -> Trials:
-    """The trials that lie at `path`; made and kept there where nobody did yet. `priors` is the folder of the prior."""
-    if not path.is_file():
-        leave_out_in_turn(settings, scene, points, PriorStore.open(priors)).save(path)
-    return Trials.load(path)
+def tried(settings: RunSettings, scene: Scene, points: TimedPoints, priors: Path) -> Trials:
+    """What trials with the prior in the folder `priors` show; they are made once and lie beside it, for every trainer.
+
+    They are the same whatever else a run has: the default backbone with all hooks.
+    """
+    store = PriorStore.open(priors)
+    known = store.tried()
+    if known is not None:
+        return Trials.from_dict(known)
+    plain = {name: table for name, table in settings.overrides.items() if name in ("plan", "priors")}
+    own = replace(settings, backbone=RunSettings.backbone, hooks=HOOK_NAMES, seed=0, overrides=plain)
+    trials = leave_out_in_turn(own, scene, points, store)
+    with contextlib.suppress(CannotWrite):  # a finished prior may lie where nobody can write
+        write_table(store.path / "trials.json", {**trials.as_dict(), "contents": store.contents}, TRIALS)
+    return trials
 
 
-def leave_out_in_turn(settings: RunSettings, scene: Scene, points: TimedPoints, store: Store) -> Trials:
+def leave_out_in_turn(settings: RunSettings, scene: Scene, points: TimedPoints, store: PriorStore) -> Trials:
     """Leave out training cameras in turn and predict them, with all of the prior in `store` and with its stereo.
 
     Args:
@@ -177,8 +176,8 @@ class _Trial:
     recording: Recording
 
     @classmethod
-    def of(cls, settings: RunSettings, scene: Scene, points: TimedPoints, store: Store) -> _Trial:
-        cameras, frames = scene.train_cameras, scene.recording.frames
+    def of(cls, settings: RunSettings, scene: Scene, points: TimedPoints, store: PriorStore) -> _Trial:
+        cameras, frames = scene.train_cameras, store.frames
         places = np.linspace(0, len(frames) - 1, INSTANTS + 2)[1:-1]
         longest = min(
             max(scene.recording.cameras[name].width, scene.recording.cameras[name].height) for name in cameras
