@@ -67,7 +67,7 @@ def run(given: Given) -> str:
     if calibration is not None:
         show(str(calibration))
     if summary.usable and can_decide(scene):
-        show(str(tried(settings, scene, points, folder)))
+        show(tried(settings, scene, points, folder)["text"])
     try:
         with in_turn(options.output):
             contact_sheet(store, scene.recording, sheet)

@@ -128,7 +128,7 @@ class Run:
             return None
         if settings.iterations < LEAST_ITERATIONS:
             return PriorStore.described(self.priors).tried()
-        return tried(settings, self.scene, points, self.priors).as_dict()
+        return tried(settings, self.scene, points, self.priors)
 
     def train(self, on_prior: Callable[[PriorSummary], None] | None = None, watch: Watch | None = None) -> None:
         """Build what is missing, then train to the last iteration, continuing from a checkpoint if there is one.

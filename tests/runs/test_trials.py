@@ -74,7 +74,7 @@ def test_ssim_at_left_out_cameras_decides_and_one_line_says_so() -> None:
     assert (helps.choice, harms.choice) == ("all", "stereo")
     assert "stereo alone is used (left-out cameras: SSIM 0.700 with it, 0.800 without)" in str(harms)
     assert "the whole prior is used" in str(helps)
-    assert Trials.from_dict(harms.as_dict()) == harms
+    assert harms.as_dict()["scores"]["all"] == {"a": {"ssim": 0.7, "psnr": 25.0}}
 
 
 @pytest.mark.parametrize(("cameras", "chosen"), [("ab", "ab"), ("abc", "ac"), ("abcd", "bd"), ("abcdefgh", "cg")])

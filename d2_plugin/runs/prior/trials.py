@@ -99,14 +99,6 @@ class Trials:
         }
         return {"choice": self.choice, "text": str(self), "cpu_seconds": self.cpu_seconds, "scores": scores}
 
-    @classmethod
-    def from_dict(cls, table: Mapping[str, Any]) -> Trials:
-        """From what `as_dict` made."""
-        scores = {
-            name: {camera: Score(**score) for camera, score in found.items()} for name, found in table["scores"].items()
-        }
-        return cls(scores["all"], scores["stereo"], table["cpu_seconds"])
-
 
 def _mean_ssim(scores: Mapping[str, Score]) -> float:
     return float(np.mean([score.ssim for score in scores.values()]))
@@ -118,20 +110,21 @@ def can_decide(scene: Scene) -> bool:
     return both and len(scene.train_cameras) >= LEAST_CAMERAS
 
 
-def tried(settings: RunSettings, scene: Scene, points: TimedPoints, priors: Path) -> Trials:
-    """What trials with the prior in the folder `priors` show; they are made once and lie beside it, for every trainer.
+def tried(settings: RunSettings, scene: Scene, points: TimedPoints, priors: Path) -> dict[str, Any]:
+    """What trials with the prior in the folder `priors` show, as `Trials.as_dict` has it.
 
-    They are the same whatever else a run has: the default backbone with all hooks.
+    They are made once, the same whatever else a run has (the default backbone with all hooks), and lie beside the prior
+    for every trainer.
     """
     store = PriorStore.open(priors)
     known = store.tried()
     if known is not None:
-        return Trials.from_dict(known)
+        return known
     plain = {name: table for name, table in settings.overrides.items() if name in ("plan", "priors")}
     own = replace(settings, backbone=RunSettings.backbone, hooks=HOOK_NAMES, seed=0, overrides=plain)
-    trials = leave_out_in_turn(own, scene, points, store)
+    trials = leave_out_in_turn(own, scene, points, store).as_dict()
     with contextlib.suppress(CannotWrite):  # a finished prior may lie where nobody can write
-        write_table(store.path / "trials.json", {**trials.as_dict(), "contents": store.contents}, TRIALS)
+        write_table(store.path / "trials.json", {**trials, "contents": store.contents}, TRIALS)
     return trials
 
 
