@@ -36,7 +36,7 @@ from d2_plugin.recordings.images import VALID_FOLDER, encode_jpeg, write_mask, w
 from d2_plugin.recordings.importing.clocks import METHODS, STAMPS, Clock, common_clock, given_clock
 from d2_plugin.recordings.importing.exposure import measured_exposures
 from d2_plugin.recordings.importing.grid import grid_of
-from d2_plugin.recordings.importing.motion import small_images
+from d2_plugin.recordings.importing.motion import watched_videos
 from d2_plugin.recordings.importing.settings import UNITS, ImportSettings, check_calibration
 from d2_plugin.recordings.importing.solved_rig import calibration_table, rig_of_videos, summary
 from d2_plugin.recordings.importing.source import Cut, VideosSource, cuts_of
@@ -198,7 +198,7 @@ def _clocks(
     def make() -> dict[str, Any]:
         chosen = settings.offsets
         if len(chosen) == 1 and chosen[0] in METHODS:
-            clocks = common_clock(videos, chosen[0], lambda: small_images(videos, cameras))
+            clocks = common_clock(videos, chosen[0], lambda: watched_videos(videos, cameras))
         else:
             clocks = given_clock(videos, chosen)
         return {name: asdict(clock) for name, clock in clocks.items()}
