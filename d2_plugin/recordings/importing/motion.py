@@ -15,12 +15,13 @@ Motion that repeats itself has another lag at which as large a share agrees as a
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from itertools import chain, combinations
 from typing import NamedTuple
 
 import numpy as np
 
-from d2_plugin.progress import progress_bar
+from d2_plugin.progress import Bar, progress_bar
 from d2_plugin.recordings.cameras.camera import CalibratedCamera
 from d2_plugin.recordings.cameras.epipolar import sampson, sift_features
 from d2_plugin.recordings.cameras.undistort import Undistortion
@@ -74,15 +75,15 @@ class Watched(NamedTuple):
 class Curve(NamedTuple):
     """How many matches of two cameras agree at each lag, of all and without each group."""
 
-    lags: np.ndarray  # [L] in steps: the clock of the other began so much later
     agree: np.ndarray  # [1 + GROUPS, L] matches
-    count: np.ndarray  # [1 + GROUPS, L] matches that could
-    spread: float  # of the excess over what chance would give, in standard deviations of independent matches
+    could: np.ndarray  # [1 + GROUPS, L] matches that can say so
+    spread: float = 1.0  # of the excess over what chance would give, in standard deviations of independent matches
 
     def excess(self, which: int) -> np.ndarray:
         """Standard deviations [L] by which more agree than at all lags together."""
-        chance = self.agree[which].sum() / max(self.count[which].sum(), 1e-9) * self.count[which]
-        return np.maximum(self.agree[which] - chance, 0) / np.sqrt(chance + 1) / self.spread
+        chance = self.agree[which].sum() / max(self.could[which].sum(), 1e-9) * self.could[which]
+        excess: np.ndarray = (self.agree[which] - chance) / np.sqrt(chance + 1) / self.spread
+        return excess
 
 
 class Seen(NamedTuple):
@@ -93,44 +94,41 @@ class Seen(NamedTuple):
     doubt: str  # why it cannot be trusted; empty where it can
 
 
-Scores = Mapping[tuple[str, str], tuple[np.ndarray, np.ndarray]]  # cameras -> (lags [L], squares of the excess [L])
+Scores = Mapping[tuple[str, str], np.ndarray]
+"""Cameras -> squares of the excess [L] at each lag: the clock of the other began L // 2 steps earlier to later."""
 
 
 def watched_videos(videos: Mapping[str, VideoFile], cameras: Mapping[str, CalibratedCamera]) -> dict[str, Watched]:
     """What moves in the beginning of all videos."""
-    seen = {}
-    with progress_bar("decode for motion", sum(min(len(v.stamps), MOST_FRAMES) for v in videos.values())) as bar:
-        done = 0
-
-        def decoded(name: str, video: VideoFile, count: int) -> Iterator[np.ndarray]:
-            nonlocal done
-            decoder = Decoder(video)
-            for index in range(count):
-                yield decoder.grey(index, LONG_SIDE)
-                bar.update(done := done + 1, name)
-            decoder.close()
-
+    seen: dict[str, Watched] = {}
+    counts = {name: min(len(video.stamps), MOST_FRAMES) for name, video in videos.items()}
+    with progress_bar("decode for motion", sum(counts.values())) as bar:
         for name, video in videos.items():
-            count = min(len(video.stamps), MOST_FRAMES)
-            images = decoded(name, video, count)
-            first = next(images)
-            straight = Undistortion(cameras[name].of_size(first.shape[::-1]))
-            seen[name] = watch(map(straight.image, chain([first], images)), video.times[:count], straight.camera)
+            decoder, before = Decoder(video), sum(counts[one] for one in seen)
+            straight = Undistortion(cameras[name].of_size(decoder.grey(0, LONG_SIDE).shape[::-1]))
+            greys = map(partial(decoder.grey, long_side=LONG_SIDE), _reported(bar, name, before, counts[name]))
+            seen[name] = watch(map(straight.image, greys), video.times[: counts[name]], straight.camera)
+            decoder.close()
     return seen
+
+
+def _reported(bar: Bar, name: str, before: int, count: int) -> Iterator[int]:
+    for index in range(count):
+        yield index
+        bar.update(before + index + 1, name)
 
 
 def watch(images: Iterable[np.ndarray], times: np.ndarray, camera: Camera) -> Watched:
     """What moves in images uint8 [h, w] of a camera at `times` [T]."""
     chosen = set(spread(range(len(times)), MOST_IMAGES))
     none = Moving(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, 128)))
-    before, moving = None, []
-    images = iter(images)
-    here = next(images)
-    for place, after in enumerate(chain(images, [None])):
-        others = [
+    before, here, moving = None, None, []
+    for place, after in enumerate(chain(images, [None]), -1):
+        beside = [
             (one, times[k] - times[place]) for one, k in ((before, place - 1), (after, place + 1)) if one is not None
         ]
-        moving.append(_moving(here, others) if others and place in chosen else none)
+        if here is not None:
+            moving.append(_moving(here, beside) if beside and place in chosen else none)
         before, here = here, after
     return Watched(camera, times, moving)
 
@@ -172,12 +170,11 @@ def offsets_from_motion(watched: Mapping[str, Watched], search: float) -> dict[s
     # An offset cannot be known better than the slowest camera tells.
     frame = max(one.frame for one in watched.values())
     step = min(one.frame for one in watched.values()) / FINE
-    curves = {}
-    for one, other in combinations(names, 2):
-        pair = curve_between(watched[one], watched[other], step, search)
-        if pair is not None:
-            curves[one, other] = pair
-    whole, *without = (_scores(curves, which) for which in range(1 + GROUPS))
+    pairs = combinations(names, 2)
+    curves = {pair: curve_between(watched[pair[0]], watched[pair[1]], step, search) for pair in pairs}
+    whole, *without = (
+        {pair: np.maximum(curve.excess(which), 0) ** 2 for pair, curve in curves.items()} for which in range(1 + GROUPS)
+    )
     offsets = _agreed(names, whole, _tree(names, whole))
     apart: dict[str, list[float]] = {name: [] for name in names}
     for scores in without:
@@ -194,23 +191,19 @@ def offsets_from_motion(watched: Mapping[str, Watched], search: float) -> dict[s
     return seen
 
 
-def _scores(curves: Mapping[tuple[str, str], Curve], which: int) -> Scores:
-    return {pair: (curve.lags, curve.excess(which) ** 2) for pair, curve in curves.items()}
+def _lags(score: np.ndarray) -> np.ndarray:
+    """The lags of scores [L], in steps."""
+    return np.arange(len(score)) - len(score) // 2
 
 
 def _tree(names: Sequence[str], scores: Scores) -> dict[str, float]:
     """A start: from the first camera on, each is hung to the one that it agrees with best."""
     offsets = {names[0]: 0.0}
     while len(offsets) < len(names):
-        best = None
-        for (one, other), (lags, score) in scores.items():
-            if (one in offsets) != (other in offsets) and len(lags) and (best is None or score.max() > best[0]):
-                lag = float(lags[score.argmax()])
-                new = (other, offsets[one] + lag) if one in offsets else (one, offsets[other] - lag)
-                best = (score.max(), *new)
-        if best is None:
-            return offsets | {name: 0.0 for name in names if name not in offsets}
-        offsets[best[1]] = best[2]
+        linking = {pair: score for pair, score in scores.items() if (pair[0] in offsets) != (pair[1] in offsets)}
+        one, other = max(linking, key=lambda pair: float(linking[pair].max()))
+        lag = float(_lags(linking[one, other])[linking[one, other].argmax()])
+        offsets |= {other: offsets[one] + lag} if one in offsets else {one: offsets[other] - lag}
     return offsets
 
 
@@ -220,72 +213,61 @@ def _agreed(names: Sequence[str], scores: Scores, start: Mapping[str, float]) ->
     for _ in range(20):
         before = dict(offsets)
         for name in names[1:]:
-            lags, total = _alone(name, offsets, scores)
-            if len(lags):
-                offsets[name] = _summit(lags, total)
+            offsets[name] = _summit(_alone(name, offsets, scores))
         if all(abs(offsets[name] - before[name]) < 0.01 for name in names):
             break
     return offsets
 
 
-def _alone(name: str, offsets: Mapping[str, float], scores: Scores) -> tuple[np.ndarray, np.ndarray]:
-    """(offsets of one camera, sum of its scores there) with the other cameras where they are."""
-    curves = []
-    for (one, other), (lags, score) in scores.items():
-        if name == other:
-            curves.append((lags + offsets[one], score))
-        elif name == one:
-            curves.append((offsets[other] - lags[::-1], score[::-1]))
-    if not curves:
-        return np.zeros(0), np.zeros(0)
-    places = np.arange(min(lags[0] for lags, _ in curves), max(lags[-1] for lags, _ in curves) + 0.5)
-    return places, np.sum([np.interp(places, lags, score, left=0, right=0) for lags, score in curves], axis=0)
+def _alone(name: str, offsets: Mapping[str, float], scores: Scores) -> np.ndarray:
+    """The sum of the scores [L] of one camera, the others where they are, at each offset of its own."""
+    total = np.zeros(len(next(iter(scores.values()))))
+    for (one, other), score in scores.items():
+        if name in (one, other):
+            places = _lags(score)
+            lags = places - offsets[one] if name == other else offsets[other] - places
+            total += np.interp(lags, places, score, left=0, right=0)
+    return total
 
 
-def _summit(places: np.ndarray, total: np.ndarray) -> float:
-    """The place of the peak, by a parabola over half a frame."""
-    top = int(total.argmax())
-    low, high = max(top - FINE // 2, 0), min(top + FINE // 2, len(places) - 1)
-    if high - low < 2:
-        return float(places[top])
-    bend, slope, _ = np.polyfit(places[low : high + 1] - places[top], total[low : high + 1], 2)
+def _summit(score: np.ndarray) -> float:
+    """The lag of the peak, by a parabola over half a frame on each side."""
+    top, lags = int(score.argmax()), _lags(score)
+    near = slice(max(top - FINE // 2, 0), top + FINE // 2 + 1)
+    bend, slope, _ = np.polyfit(lags[near] - lags[top], score[near], 2)
     shift = -slope / (2 * bend) if bend < 0 else 0.0
-    return float(places[top] + np.clip(shift, -FINE / 2, FINE / 2))
+    return float(lags[top] + np.clip(shift, -FINE / 2, FINE / 2))
 
 
 def _disagreement(name: str, offsets: Mapping[str, float], scores: Scores) -> float:
     """Standard error, in steps, by how far the pairs of a camera each have their peak from where all together do."""
     off, weights = [], []
-    for pair, (lags, score) in scores.items():
-        lag = offsets[pair[1]] - offsets[pair[0]]
-        near = np.abs(lags - lag) <= 2 * FINE
-        if name in pair and near.any() and score[near].max() > 0:
-            off.append(_summit(lags[near], score[near]) - lag)
-            weights.append(float(score[near].max()))
-    if len(off) < 2:
-        return 0.0
-    return float(np.sqrt(np.average(np.square(off), weights=weights) / (len(off) - 1)))
+    for (one, other), score in scores.items():
+        lag = offsets[other] - offsets[one]
+        near = np.where(np.abs(_lags(score) - lag) <= 2 * FINE, score, 0)
+        if name in (one, other) and near.any():
+            off.append(_summit(near) - lag)
+            weights.append(float(near.max()))
+    return float(np.sqrt(np.average(np.square(off), weights=weights) / (len(off) - 1))) if len(off) > 1 else 0.0
 
 
 def _doubt(
     name: str, offsets: Mapping[str, float], curves: Mapping[tuple[str, str], Curve], scores: Scores, frame: float
 ) -> str:
     """Why a camera's offset cannot be trusted, or nothing; `frame` is in steps."""
-    places, total = _alone(name, offsets, scores)
-    if not len(places):
-        return "what moves in it is in no other camera"
-    top = int(np.abs(places - offsets[name]).argmin())
+    total = _alone(name, offsets, scores)
+    top = int(np.abs(_lags(total) - offsets[name]).argmin())
     if total[top] < SURE**2:
         said = f"{np.sqrt(total[top]):.1f} standard deviations, {SURE:g} are asked"
         return f"what moves in it hardly agrees with the others ({said})"
     repeated = {}  # what the scores would be if as large a share of the matches agreed at all lags as does at the best
-    for pair, (lags, score) in scores.items():
-        lag, count = offsets[pair[1]] - offsets[pair[0]], curves[pair].count[0]
-        repeated[pair] = lags, np.interp(lag, lags, score) * count / max(np.interp(lag, lags, count), 1e-9)
-    best, likely = np.sqrt(total), np.sqrt(_alone(name, offsets, repeated)[1])
+    for pair, score in scores.items():
+        lag, lags, count = offsets[pair[1]] - offsets[pair[0]], _lags(score), curves[pair].could[0]
+        repeated[pair] = np.interp(lag, lags, score) * count / max(np.interp(lag, lags, count), 1e-9)
+    best, likely = np.sqrt(total), np.sqrt(_alone(name, offsets, repeated))
     rivals = _outside(total, top) & (best > RIVAL) & (best > likely - RIVAL)
     if rivals.any():
-        apart = (places[np.where(rivals, total, 0).argmax()] - places[top]) / frame
+        apart = (int(np.where(rivals, total, 0).argmax()) - top) / frame
         return f"an offset that differs by {apart:+.1f} frames is as good (is the motion repeated?)"
     return ""
 
@@ -302,16 +284,14 @@ def _outside(total: np.ndarray, top: int) -> np.ndarray:
     return outside
 
 
-def curve_between(one: Watched, other: Watched, step: float, search: float) -> Curve | None:
-    """How many matches of two cameras agree at each lag; None where there are none.
+def curve_between(one: Watched, other: Watched, step: float, search: float) -> Curve:
+    """How many matches of two cameras agree at each lag.
 
     Each match tells of lags within a frame of how far its images are apart by their stamps, those next to that most.
     """
     frame, size = max(one.frame, other.frame), int(np.ceil(search / step))
     lags = np.arange(-size, size + 1)
     apart, off, own, others, group = _matches(one, other, search + frame)
-    if not len(apart):
-        return None
     slope = (others - own) / 2  # pixels per second by which it leaves its line where the other clock began later
     # What is one thing stays on its line from one instant to the next, so the two ends cross it alike.
     unlike = (others + own) / 2 * frame / (0.5 + np.abs(slope) * frame / 4)
@@ -328,9 +308,8 @@ def curve_between(one: Watched, other: Watched, step: float, search: float) -> C
     kept = np.concatenate([np.ones((1, GROUPS)), 1 - np.eye(GROUPS)])  # all, then without each group
     begun, ended = (other.times[place] + lags * step for place in (0, -1))
     common = np.minimum(one.times[-1], ended) - np.maximum(one.times[0], begun) > (LEAST_COMMON - 1.5) * frame
-    curve = Curve(lags, kept @ agree * common, kept @ count * common, 1.0)
-    chance = curve.agree[0].sum() / max(curve.count[0].sum(), 1e-9) * curve.count[0]
-    excess = ((curve.agree[0] - chance) / np.sqrt(chance + 1))[curve.count[0] > 1]
+    curve = Curve(kept @ agree * common, kept @ count * common)
+    excess = curve.excess(0)[curve.could[0] > 1]
     wide = 1.4826 * float(np.median(np.abs(excess - np.median(excess)))) if len(excess) else 1.0
     return curve._replace(spread=max(wide, 1.0))
 

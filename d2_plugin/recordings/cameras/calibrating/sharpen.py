@@ -43,7 +43,8 @@ def sharpened(
 
     Features without images stay as they are.
     """
-    if any(features[name].greys is None for name in tracks.names):
+    greys = {name: features[name].greys or () for name in tracks.names}
+    if not all(greys.values()):
         return dict(features), tracks
     moved = {name: features[name].pixels.copy() for name in tracks.names}
     seen = tracks.seen.copy()
@@ -51,7 +52,7 @@ def sharpened(
     first = order[(seen[:, order] >= 0).argmax(axis=1)]
     moments = np.array([features[tracks.names[one]].moments[own[one]] for one, own in zip(first, seen)], int)
     for moment in np.unique(moments):
-        fine = cache(lambda name, moment=moment: _enlarged(features[name].greys[moment]))
+        fine = cache(lambda name, moment=moment: _enlarged(greys[name][moment]))
         for one, other in permutations(range(len(tracks.names)), 2):
             rows = np.flatnonzero((moments == moment) & (first == one) & (seen[:, other] >= 0))
             if len(rows):
