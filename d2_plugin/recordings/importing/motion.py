@@ -14,14 +14,13 @@ Motion that repeats itself has another lag at which as large a share agrees as a
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from functools import partial
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import chain, combinations
 from typing import NamedTuple
 
 import numpy as np
 
-from d2_plugin.progress import Bar, progress_bar
+from d2_plugin.progress import progress_bar
 from d2_plugin.recordings.cameras.camera import CalibratedCamera
 from d2_plugin.recordings.cameras.epipolar import sampson, sift_features
 from d2_plugin.recordings.cameras.undistort import Undistortion
@@ -104,18 +103,13 @@ def watched_videos(videos: Mapping[str, VideoFile], cameras: Mapping[str, Calibr
     counts = {name: min(len(video.stamps), MOST_FRAMES) for name, video in videos.items()}
     with progress_bar("decode for motion", sum(counts.values())) as bar:
         for name, video in videos.items():
-            decoder, before = Decoder(video), sum(counts[one] for one in seen)
+            decoder = Decoder(video)
             straight = Undistortion(cameras[name].of_size(decoder.grey(0, LONG_SIDE).shape[::-1]))
-            greys = map(partial(decoder.grey, long_side=LONG_SIDE), _reported(bar, name, before, counts[name]))
-            seen[name] = watch(map(straight.image, greys), video.times[: counts[name]], straight.camera)
+            images = (straight.image(decoder.grey(index, LONG_SIDE)) for index in range(counts[name]))
+            seen[name] = watch(images, video.times[: counts[name]], straight.camera)
             decoder.close()
+            bar.update(sum(counts[one] for one in seen), name)
     return seen
-
-
-def _reported(bar: Bar, name: str, before: int, count: int) -> Iterator[int]:
-    for index in range(count):
-        yield index
-        bar.update(before + index + 1, name)
 
 
 def watch(images: Iterable[np.ndarray], times: np.ndarray, camera: Camera) -> Watched:
@@ -317,24 +311,21 @@ def curve_between(one: Watched, other: Watched, step: float, search: float) -> C
 def _matches(one: Watched, other: Watched, search: float) -> tuple[np.ndarray, ...]:
     """Of each match [n]: seconds between the stamps, pixels from its line, how fast each end leaves it, its group."""
     a, b = one.camera, other.camera
-    places = [place for place, moving in enumerate(other.moving) if len(moving.pixels)]
-    anchors = [place for place, moving in enumerate(one.moving) if len(moving.pixels)]
-    found = []
-    for i in spread(anchors, MOST_ANCHORS) if anchors else ():
-        here = one.moving[i]
-        for j in places:
-            apart = one.times[i] - other.times[j]
+    own, others = ([place for place, found in enumerate(w.moving) if len(found.pixels)] for w in (one, other))
+    found = [np.zeros((0, 9))]
+    for i in spread(own, MOST_ANCHORS) if own else ():
+        for j in others:
+            here, there, apart = one.moving[i], other.moving[j], one.times[i] - other.times[j]
             if abs(apart) > search:
                 continue
-            there = other.moving[j]
             alike = here.descriptors @ there.descriptors.T
             best = (alike == alike.max(axis=0)) | (alike == alike.max(axis=1, keepdims=True))
             k, m = np.nonzero(best & (alike > ALIKE))
             ends = here.pixels[k], here.velocities[k], there.pixels[m], there.velocities[m]
             found.append(np.column_stack([np.full(len(k), apart), *ends]))
-    both = np.concatenate(found) if found else np.zeros((0, 9))
+    both = np.concatenate(found)
     p, v, q, w = (both[:, c : c + 2] for c in (1, 3, 5, 7))
     off, soon = sampson(a, b, p, q), max(one.frame, other.frame) / 4
-    own, others = (sampson(a, b, p + v * soon, q) - off) / soon, (sampson(a, b, p, q + w * soon) - off) / soon
+    leaves = (sampson(a, b, p + v * soon, q) - off) / soon, (sampson(a, b, p, q + w * soon) - off) / soon
     cells = np.floor(p / (a.width, a.height) * GROUPS).astype(int)
-    return both[:, 0], off, own, others, (cells[:, 0] + 3 * cells[:, 1]) % GROUPS
+    return both[:, 0], off, *leaves, (cells[:, 0] + 3 * cells[:, 1]) % GROUPS
