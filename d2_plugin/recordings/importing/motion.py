@@ -93,8 +93,7 @@ class Seen(NamedTuple):
     doubt: str  # why it cannot be trusted; empty where it can
 
 
-Scores = Mapping[tuple[str, str], np.ndarray]
-"""Cameras -> squares of the excess [L] at each lag: the clock of the other began L // 2 steps earlier to later."""
+Scores = Mapping[tuple[str, str], np.ndarray]  # cameras -> squares of the excess [L] at each of `_lags`
 
 
 def watched_videos(videos: Mapping[str, VideoFile], cameras: Mapping[str, CalibratedCamera]) -> dict[str, Watched]:
@@ -186,7 +185,7 @@ def offsets_from_motion(watched: Mapping[str, Watched], search: float) -> dict[s
 
 
 def _lags(score: np.ndarray) -> np.ndarray:
-    """The lags of scores [L], in steps."""
+    """Lags [L] of scores [L], in steps: the clock of the other camera began so much later."""
     return np.arange(len(score)) - len(score) // 2
 
 
@@ -316,11 +315,9 @@ def _matches(one: Watched, other: Watched, search: float) -> tuple[np.ndarray, .
     for i in spread(own, MOST_ANCHORS) if own else ():
         for j in others:
             here, there, apart = one.moving[i], other.moving[j], one.times[i] - other.times[j]
-            if abs(apart) > search:
-                continue
             alike = here.descriptors @ there.descriptors.T
             best = (alike == alike.max(axis=0)) | (alike == alike.max(axis=1, keepdims=True))
-            k, m = np.nonzero(best & (alike > ALIKE))
+            k, m = np.nonzero(best & (alike > ALIKE) & (abs(apart) <= search))
             ends = here.pixels[k], here.velocities[k], there.pixels[m], there.velocities[m]
             found.append(np.column_stack([np.full(len(k), apart), *ends]))
     both = np.concatenate(found)

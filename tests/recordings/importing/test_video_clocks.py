@@ -96,7 +96,7 @@ CASES = [
     ("plaza", {"01": 0, "02": -7, "03": 5, "04": 2}),
     ("studio", {"00": 0, "02": 5, "05": -3, "07": 2}),
     ("studio", {"03": 0, "04": -3}),
-    ("dome", {"03": 0, "07": 4, "12": -9, "15": 6}),
+    ("dome", {"03": 0, "07": 2, "12": -4, "15": 3}),
 ]
 
 
@@ -105,7 +105,8 @@ def test_motion_finds_the_offset_within_two_of_its_errors_and_half_a_frame(
     shared_data: Callable[[str], Path], scene: str, offsets: dict[str, float]
 ) -> None:
     recording = open_recording(shared_data(scene))
-    seen = by_motion(filmed(recording, offsets, 0))
+    every = len(recording.frames) // 20  # of dome each third
+    seen = by_motion(filmed(recording, offsets, 0, recording.frames[::every]))
     for name, offset in offsets.items():
         assert not seen[name].doubt
         off = abs(seen[name].seconds * recording.fps - offset)
