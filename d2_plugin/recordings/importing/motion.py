@@ -68,7 +68,7 @@ class Watched(NamedTuple):
     @property
     def frame(self) -> float:
         """Seconds from one image to the next."""
-        return float(np.median(np.diff(self.times)))
+        return float(np.median(np.diff(self.times))) if len(self.times) > 1 else 1.0
 
 
 class Curve(NamedTuple):
@@ -282,7 +282,7 @@ def curve_between(one: Watched, other: Watched, step: float, search: float) -> C
 
     Each match tells of lags within a frame of how far its images are apart by their stamps, those next to that most.
     """
-    frame, size = max(one.frame, other.frame), int(np.ceil(search / step))
+    frame, size = max(one.frame, other.frame), max(int(np.ceil(search / step)), FINE)
     lags = np.arange(-size, size + 1)
     apart, off, own, others, group = _matches(one, other, search + frame)
     slope = (others - own) / 2  # pixels per second by which it leaves its line where the other clock began later
