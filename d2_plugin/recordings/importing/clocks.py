@@ -63,7 +63,7 @@ def common_clock(
     """When each video's clock began, by the best evidence there is: timecode, then sound, then motion.
 
     Where nothing says it and all files are alike, their own stamps are taken, and `method` says so.
-    `watching` gives small images of all cameras; all videos are decoded for it, so only where motion must decide. With
+    `watching` says what moves in all cameras; all videos are decoded for it, so only where motion must decide. With
     None, as motion takes the calibration that may be looked for, nothing comes back there.
 
     Raises:
@@ -156,8 +156,7 @@ def _of_motion(
         name, why = next(iter(doubtful.items()))
         whose = f"camera {name}" if len(names) - len(doubtful) > 1 else "the cameras"
         return [], f"motion does not say when {whose} started ({why})"
-    first = seen[names[0]].seconds
-    return [Evidence(names[0], name, seen[name].seconds - first, seen[name].error, "motion") for name in names[1:]], ""
+    return [Evidence(names[0], name, seen[name].seconds, seen[name].error, "motion") for name in names[1:]], ""
 
 
 def of_one_recorder(videos: Collection[VideoFile]) -> bool:

@@ -36,7 +36,7 @@ from d2_plugin.recordings.images import VALID_FOLDER, encode_jpeg, write_mask, w
 from d2_plugin.recordings.importing.clocks import METHODS, STAMPS, Clock, common_clock, given_clock
 from d2_plugin.recordings.importing.exposure import measured_exposures
 from d2_plugin.recordings.importing.grid import grid_of
-from d2_plugin.recordings.importing.motion import small_images
+from d2_plugin.recordings.importing.motion import watched_videos
 from d2_plugin.recordings.importing.settings import UNITS, ImportSettings, check_calibration
 from d2_plugin.recordings.importing.solved_rig import calibration_table, rig_of_videos, summary
 from d2_plugin.recordings.importing.source import Cut, VideosSource, cuts_of
@@ -87,9 +87,10 @@ def import_videos(settings: ImportSettings, report: Report = lambda line: None) 
             write_text(folder / SOLVED, table + "\n")
         clocks = _clocks(settings, folder, videos, cameras)
         report(_clocks_in_words(clocks, videos))
+        guessed = {f"the cameras' clocks are {one.method}" for one in clocks.values() if one.method.startswith(STAMPS)}
         grid = grid_of(videos, clocks, settings.rate, settings.times, settings.frames)
         source = VideosSource(videos, grid.indices, cameras, cuts)
-        frames, notes = tuple(grid.indices[next(iter(videos))]), (*notes, *_notes_of_clocks(clocks), *grid.notes)
+        frames, notes = tuple(grid.indices[next(iter(videos))]), (*notes, *guessed, *grid.notes)
         recording = Recording(
             folder.resolve().name, source.pinholes(), frames, grid.rate, source, folder, notes=notes, late=grid.late
         )
@@ -198,7 +199,7 @@ def _clocks(
     def make() -> dict[str, Any]:
         chosen = settings.offsets
         if len(chosen) == 1 and chosen[0] in METHODS:
-            clocks = common_clock(videos, chosen[0], lambda: small_images(videos, cameras))
+            clocks = common_clock(videos, chosen[0], lambda: watched_videos(videos, cameras))
         else:
             clocks = given_clock(videos, chosen)
         return {name: asdict(clock) for name, clock in clocks.items()}
@@ -213,11 +214,6 @@ def _clocks_in_words(clocks: Mapping[str, Clock], videos: Mapping[str, VideoFile
 
     methods = " and ".join(sorted({clock.method for clock in clocks.values()}))
     return f"start in frames, by {methods}: {', '.join(one(*item) for item in clocks.items())}"
-
-
-def _notes_of_clocks(clocks: Mapping[str, Clock]) -> tuple[str, ...]:
-    guessed = next((clock.method for clock in clocks.values() if clock.method.startswith(STAMPS)), None)
-    return () if guessed is None else (f"the cameras' clocks are {guessed}",)
 
 
 def _notes_of_videos(settings: ImportSettings, videos: Mapping[str, VideoFile], few: Recording) -> tuple[str, ...]:

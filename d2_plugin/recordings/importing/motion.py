@@ -1,57 +1,88 @@
-"""When cameras started, from what they saw move: change over time, plane by plane through the cameras' baseline.
+"""When cameras started, from what they saw move: features whose way crosses the epipolar lines of other cameras.
 
-A point that moves lies, in both images of a pair of cameras, in the same half-plane through the line that joins them,
-however far away it is. So the change of brightness from one frame to the next is added up per half-plane: two profiles
-over angle and time, which are alike once they are laid over each other at the right lag. Their correlation over the
-lag, summed over all pairs, has its peak where the clocks agree, and between frames too, since the profiles are
-interpolated. Gains, turns and frame rates of the cameras do not matter, and each image is first given the brightness
-of the median one, since a drift of the exposure is no motion.
+A moving feature lies on the epipolar line of its match in another camera only where both images are of one instant. So
+each match of two images says how much later one was taken than the other: its distance from the line over the speed at
+which it crosses it. A false match says nothing in particular, and at the right lag of two clocks many agree. Their
+share over the lag is held against that of all lags; squares of its excess in standard deviations, which are twice
+logarithms of likelihood ratios, add up over all pairs of cameras. Frame rates do not matter, nor gains, which change
+no feature's place.
 
-The error is that of leaving out one group of half-planes after another (the jackknife of Quenouille and Tukey), and of
-the disagreement of all pairs of cameras about the same offsets: where three contradict each other, it is no clock.
+The error is that of leaving out one part of the images after another (the jackknife of Quenouille and Tukey), of the
+disagreement of all pairs of cameras about the same offsets, and of calibrations, which put all lines a little wrong.
+Motion that repeats itself has another lag at which as large a share agrees as at the best: that is no clock.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from itertools import combinations
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import chain, combinations
 from typing import NamedTuple
 
 import numpy as np
 
 from d2_plugin.progress import progress_bar
 from d2_plugin.recordings.cameras.camera import CalibratedCamera
+from d2_plugin.recordings.cameras.epipolar import sampson, sift_features
 from d2_plugin.recordings.cameras.undistort import Undistortion
+from d2_plugin.recordings.images import opencv
 from d2_plugin.recordings.importing.video import Decoder, VideoFile
 from d2_plugin.recordings.recording import Camera
+from d2_plugin.recordings.selection import spread
 
-LONG_SIDE = 160  # pixels of the images that are compared
-MOST_FRAMES = 900  # of each camera; they take 13 MB
-FEWEST = 8  # frames that a camera must share with one of the others
-ALIKE = 0.2  # mean correlation that the pairs of a camera must reach
-RIVAL = 0.8  # another lag that is this good, outside of the peak, makes a camera's offset doubtful
+LONG_SIDE = 480  # pixels of the images that are looked at
+MOST_FRAMES = 900  # of each camera, from its beginning
+MOST_IMAGES = 150  # of these, in which features are looked for
+MOST_ANCHORS = 48  # of these, which are matched with all of another camera
+MOST_FEATURES, CONTRAST = 200, 0.005  # of an image, where it changes; OpenCV's contrast is .04
+NOISE = (4.0, 1.0)  # change counts above this many times that of half of the pixels, and this many levels of 255 more
+SLOWEST = 0.4  # pixels from one frame to the next: what is slower stands still
+BACK = 0.5  # pixels by which a feature that is followed to the next frame and back may miss itself
+ALIKE = 0.7  # product of two descriptors that may show the same thing
+NEAR = 0.7  # pixels, standard deviation of a match from its epipolar line
+SURE = 4.0  # standard deviations by which each camera's best lag must stand out; by chance one in 30,000 lags does
+RIVAL = (
+    3.0  # the same of other lags that are looked at, and by which they must be worse than motion that repeats itself
+)
 VAGUE = 0.7  # frames of standard error from which motion says nothing
-LEAST_ERROR = 0.25  # frames: cameras see other sides of what moves, which no half-plane of one sort tells apart
-PLANES, GROUPS = 48, 8  # half-planes between the common limits of two images, and groups of neighbours among them
-FINE = 8  # steps per frame in which lags are compared; between them lies a parabola
-NOISE = (2.0, 3.0)  # change counts above this many times a pixel's usual change, and this many levels of 255 more
+LEAST_ERROR = 0.15  # frames: what a good calibration is wrong by is half a pixel
+GROUPS = 8  # parts of the image
 LEAST_COMMON = 5  # frames that two cameras must share at a lag
+FINE = 8  # steps per frame in which lags are compared; between them lies a parabola
+
+
+class Moving(NamedTuple):
+    """Features of an image that move."""
+
+    pixels: np.ndarray  # [n, 2]
+    velocities: np.ndarray  # [n, 2] pixels per second
+    descriptors: np.ndarray  # [n, 128] of length 1
 
 
 class Watched(NamedTuple):
-    """Small images of a camera that stands still."""
+    """What a camera that stands still saw move."""
 
     camera: Camera  # the pinhole of the small images
-    images: np.ndarray  # [T, h, w] uint8, brightness
     times: np.ndarray  # [T] seconds on the clock of the video
+    moving: Sequence[Moving]  # [T]
+
+    @property
+    def frame(self) -> float:
+        """Seconds from one image to the next."""
+        return float(np.median(np.diff(self.times))) if len(self.times) > 1 else 1.0
 
 
 class Curve(NamedTuple):
-    """How well two cameras agree at each lag."""
+    """How many matches of two cameras agree at each lag, of all and without each group."""
 
-    lags: np.ndarray  # [L] in steps: the clock of the other began so much later
-    correlation: np.ndarray  # [1 + GROUPS, L] of all half-planes, then without each group; 0 at too few frames
-    common: np.ndarray  # [L] frames
+    agree: np.ndarray  # [1 + GROUPS, L] matches
+    could: np.ndarray  # [1 + GROUPS, L] matches that can say so
+    spread: float = 1.0  # of the excess over what chance would give, in standard deviations of independent matches
+
+    def excess(self, which: int) -> np.ndarray:
+        """Standard deviations [L] by which more agree than at all lags together."""
+        chance = self.agree[which].sum() / max(self.could[which].sum(), 1e-9) * self.could[which]
+        excess: np.ndarray = (self.agree[which] - chance) / np.sqrt(chance + 1) / self.spread
+        return excess
 
 
 class Seen(NamedTuple):
@@ -62,25 +93,63 @@ class Seen(NamedTuple):
     doubt: str  # why it cannot be trusted; empty where it can
 
 
-Scores = Mapping[tuple[str, str], tuple[np.ndarray, np.ndarray]]  # cameras -> (lags [L], how well they agree there [L])
+Scores = Mapping[tuple[str, str], np.ndarray]  # cameras -> squares of the excess [L] at each of `_lags`
 
 
-def small_images(videos: Mapping[str, VideoFile], cameras: Mapping[str, CalibratedCamera]) -> dict[str, Watched]:
-    """Small undistorted images of all cameras, from the beginning."""
-    watched = {}
-    with progress_bar("decode for motion", sum(min(len(v.stamps), MOST_FRAMES) for v in videos.values())) as bar:
-        done = 0
+def watched_videos(videos: Mapping[str, VideoFile], cameras: Mapping[str, CalibratedCamera]) -> dict[str, Watched]:
+    """What moves in the beginning of all videos."""
+    seen: dict[str, Watched] = {}
+    counts = {name: min(len(video.stamps), MOST_FRAMES) for name, video in videos.items()}
+    with progress_bar("decode for motion", sum(counts.values())) as bar:
         for name, video in videos.items():
-            decoder, count = Decoder(video), min(len(video.stamps), MOST_FRAMES)
-            images = []
-            for index in range(count):
-                images.append(decoder.grey(index, LONG_SIDE))
-                bar.update(done := done + 1, name)
+            decoder = Decoder(video)
+            straight = Undistortion(cameras[name].of_size(decoder.grey(0, LONG_SIDE).shape[::-1]))
+            images = (straight.image(decoder.grey(index, LONG_SIDE)) for index in range(counts[name]))
+            seen[name] = watch(images, video.times[: counts[name]], straight.camera)
             decoder.close()
-            undistortion = Undistortion(cameras[name].of_size(images[0].shape[::-1]))
-            straight = np.stack([undistortion.image(image) for image in images])
-            watched[name] = Watched(undistortion.camera, straight, video.times[:count])
-    return watched
+            bar.update(sum(counts[one] for one in seen), name)
+    return seen
+
+
+def watch(images: Iterable[np.ndarray], times: np.ndarray, camera: Camera) -> Watched:
+    """What moves in images uint8 [h, w] of a camera at `times` [T]."""
+    chosen = set(spread(range(len(times)), MOST_IMAGES))
+    none = Moving(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, 128)))
+    before, here, moving = None, None, []
+    for place, after in enumerate(chain(images, [None]), -1):
+        beside = [
+            (one, times[k] - times[place]) for one, k in ((before, place - 1), (after, place + 1)) if one is not None
+        ]
+        if here is not None:
+            moving.append(_moving(here, beside) if beside and place in chosen else none)
+        before, here = here, after
+    return Watched(camera, times, moving)
+
+
+def _moving(here: np.ndarray, others: Sequence[tuple[np.ndarray, float]]) -> Moving:
+    """What moves in an image, by the images next to it, each so many seconds later."""
+    cv2 = opencv("finding clocks by motion")
+    gains = [np.median((here + 1.0) / (one + 1.0)) for one, _ in others]
+    alike = [(one * gain).clip(0, 255).astype(np.uint8) for gain, (one, _) in zip(gains, others)]
+    change = np.max([cv2.GaussianBlur(cv2.absdiff(one, here).astype(np.float32), (0, 0), 1.5) for one in alike], axis=0)
+    changes = cv2.dilate((change > NOISE[0] * np.median(change) + NOISE[1]).astype(np.uint8), np.ones((5, 5)))
+    grey = cv2.cvtColor(here, cv2.COLOR_GRAY2RGB)
+    pixels, descriptors, _ = sift_features(grey, MOST_FEATURES, "finding clocks by motion", CONTRAST, changes)
+    if not len(pixels):
+        return Moving(pixels, pixels, descriptors)
+    start, found = (pixels - 0.5).astype(np.float32)[:, None], []
+    for one, (_, later) in zip(alike, others):
+        there = cv2.calcOpticalFlowPyrLK(here, one, start, None, winSize=(15, 15))[0]
+        back = cv2.calcOpticalFlowPyrLK(one, here, there, None, winSize=(15, 15))[0]
+        sure = np.linalg.norm(back - start, axis=2) < BACK
+        found.append(np.where(sure, (there - start)[:, 0] / later, np.nan))
+    frame = float(np.mean([abs(later) for _, later in others]))
+    first, last = found[0], found[-1]
+    velocities = np.where(np.isnan(first), last, np.where(np.isnan(last), first, (first + last) / 2))
+    way, bend = (np.linalg.norm(one, axis=1) * frame for one in (velocities, first - last))
+    kept = (way > SLOWEST) & ~(bend > way + 2)  # what turns back within a frame was not followed
+    descriptors = np.sqrt(descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-9))  # Arandjelovic 2012
+    return Moving(pixels[kept], velocities[kept], descriptors[kept])
 
 
 def offsets_from_motion(watched: Mapping[str, Watched], search: float) -> dict[str, Seen]:
@@ -92,15 +161,13 @@ def offsets_from_motion(watched: Mapping[str, Watched], search: float) -> dict[s
     """
     names = list(watched)
     # An offset cannot be known better than the slowest camera tells.
-    frame = max(float(np.median(np.diff(one.times))) for one in watched.values())
-    step = float(np.median(np.concatenate([np.diff(one.times) for one in watched.values()]))) / FINE
-    changes = {name: changes_of(one) for name, one in watched.items()}
-    curves = {}
-    for one, other in combinations(names, 2):
-        pair = curve_between(watched[one], watched[other], changes[one], changes[other], step, search)
-        if pair is not None:
-            curves[one, other] = pair
-    whole, *without = (_scores(curves, which) for which in range(1 + GROUPS))
+    frame = max(one.frame for one in watched.values())
+    step = min(one.frame for one in watched.values()) / FINE
+    pairs = combinations(names, 2)
+    curves = {pair: curve_between(watched[pair[0]], watched[pair[1]], step, search) for pair in pairs}
+    whole, *without = (
+        {pair: np.maximum(curve.excess(which), 0) ** 2 for pair, curve in curves.items()} for which in range(1 + GROUPS)
+    )
     offsets = _agreed(names, whole, _tree(names, whole))
     apart: dict[str, list[float]] = {name: [] for name in names}
     for scores in without:
@@ -110,34 +177,26 @@ def offsets_from_motion(watched: Mapping[str, Watched], search: float) -> dict[s
     for name in names:
         left_out = np.sqrt((GROUPS - 1) / GROUPS * np.square(np.array(apart[name]) - np.mean(apart[name])).sum())
         error = float(np.hypot(np.hypot(left_out, _disagreement(name, offsets, whole)) * step, LEAST_ERROR * frame))
-        doubt = _doubt(name, offsets, curves, whole)
+        doubt = _doubt(name, offsets, curves, whole, frame / step)
         if not doubt and error > VAGUE * frame:
             doubt = f"its offset is uncertain by {error / frame:.1f} frames: too little moves in it"
         seen[name] = Seen(offsets[name] * step, error, doubt)
     return seen
 
 
-def _scores(curves: Mapping[tuple[str, str], Curve], which: int) -> Scores:
-    """Fisher's z of the correlations times the root of the common frames: a chance peak counts less."""
-    return {
-        pair: (curve.lags, np.arctanh(np.clip(curve.correlation[which], -0.999, 0.999)) * np.sqrt(curve.common))
-        for pair, curve in curves.items()
-    }
+def _lags(score: np.ndarray) -> np.ndarray:
+    """Lags [L] of scores [L], in steps: the clock of the other camera began so much later."""
+    return np.arange(len(score)) - len(score) // 2
 
 
 def _tree(names: Sequence[str], scores: Scores) -> dict[str, float]:
     """A start: from the first camera on, each is hung to the one that it agrees with best."""
     offsets = {names[0]: 0.0}
     while len(offsets) < len(names):
-        best = None
-        for (one, other), (lags, score) in scores.items():
-            if (one in offsets) != (other in offsets) and len(lags) and (best is None or score.max() > best[0]):
-                lag = float(lags[score.argmax()])
-                new = (other, offsets[one] + lag) if one in offsets else (one, offsets[other] - lag)
-                best = (score.max(), *new)
-        if best is None:
-            return offsets | {name: 0.0 for name in names if name not in offsets}
-        offsets[best[1]] = best[2]
+        linking = {pair: score for pair, score in scores.items() if (pair[0] in offsets) != (pair[1] in offsets)}
+        one, other = max(linking, key=lambda pair: float(linking[pair].max()))
+        lag = float(_lags(linking[one, other])[linking[one, other].argmax()])
+        offsets |= {other: offsets[one] + lag} if one in offsets else {one: offsets[other] - lag}
     return offsets
 
 
@@ -147,76 +206,67 @@ def _agreed(names: Sequence[str], scores: Scores, start: Mapping[str, float]) ->
     for _ in range(20):
         before = dict(offsets)
         for name in names[1:]:
-            lags, total = _alone(name, offsets, scores)
-            if len(lags):
-                offsets[name] = _summit(lags, total)
+            offsets[name] = _summit(_alone(name, offsets, scores))
         if all(abs(offsets[name] - before[name]) < 0.01 for name in names):
             break
     return offsets
 
 
-def _alone(name: str, offsets: Mapping[str, float], scores: Scores) -> tuple[np.ndarray, np.ndarray]:
-    """(offsets of one camera, sum of its scores there) with the other cameras where they are."""
-    curves = []
-    for (one, other), (lags, score) in scores.items():
-        if name == other:
-            curves.append((lags + offsets[one], score))
-        elif name == one:
-            curves.append((offsets[other] - lags[::-1], score[::-1]))
-    if not curves:
-        return np.zeros(0), np.zeros(0)
-    places = np.arange(min(lags[0] for lags, _ in curves), max(lags[-1] for lags, _ in curves) + 0.5)
-    return places, np.sum([np.interp(places, lags, score, left=0, right=0) for lags, score in curves], axis=0)
+def _alone(name: str, offsets: Mapping[str, float], scores: Scores) -> np.ndarray:
+    """The sum of the scores [L] of one camera, the others where they are, at each offset of its own."""
+    total = np.zeros(len(next(iter(scores.values()))))
+    for (one, other), score in scores.items():
+        if name in (one, other):
+            places = _lags(score)
+            lags = places - offsets[one] if name == other else offsets[other] - places
+            total += np.interp(lags, places, score, left=0, right=0)
+    return total
 
 
-def _summit(places: np.ndarray, total: np.ndarray) -> float:
-    """The place of the peak, by a parabola over half a frame."""
-    top = int(total.argmax())
-    low, high = max(top - FINE // 2, 0), min(top + FINE // 2, len(places) - 1)
-    if high - low < 2:
-        return float(places[top])
-    bend, slope, _ = np.polyfit(places[low : high + 1] - places[top], total[low : high + 1], 2)
+def _summit(score: np.ndarray) -> float:
+    """The lag of the peak, by a parabola over half a frame on each side."""
+    top, lags = int(score.argmax()), _lags(score)
+    near = slice(max(top - FINE // 2, 0), top + FINE // 2 + 1)
+    bend, slope, _ = np.polyfit(lags[near] - lags[top], score[near], 2)
     shift = -slope / (2 * bend) if bend < 0 else 0.0
-    return float(places[top] + np.clip(shift, -FINE / 2, FINE / 2))
+    return float(lags[top] + np.clip(shift, -FINE / 2, FINE / 2))
 
 
 def _disagreement(name: str, offsets: Mapping[str, float], scores: Scores) -> float:
     """Standard error, in steps, by how far the pairs of a camera each have their peak from where all together do."""
     off, weights = [], []
-    for pair, (lags, score) in scores.items():
-        lag = offsets[pair[1]] - offsets[pair[0]]
-        near = np.abs(lags - lag) <= 2 * FINE
-        if name in pair and near.any() and score[near].max() > 0:
-            off.append(_summit(lags[near], score[near]) - lag)
-            weights.append(float(score[near].max()))
-    if len(off) < 2:
-        return 0.0
-    return float(np.sqrt(np.average(np.square(off), weights=weights) / (len(off) - 1)))
+    for (one, other), score in scores.items():
+        lag = offsets[other] - offsets[one]
+        near = np.where(np.abs(_lags(score) - lag) <= 2 * FINE, score, 0)
+        if name in (one, other) and near.any():
+            off.append(_summit(near) - lag)
+            weights.append(float(near.max()))
+    return float(np.sqrt(np.average(np.square(off), weights=weights) / (len(off) - 1))) if len(off) > 1 else 0.0
 
 
-def _doubt(name: str, offsets: Mapping[str, float], curves: Mapping[tuple[str, str], Curve], scores: Scores) -> str:
-    """Why a camera's offset cannot be trusted, or nothing."""
-    own = {pair: curve for pair, curve in curves.items() if name in pair}
-    places, total = _alone(name, offsets, scores)
-    if not own or not len(places):
-        return "it shares no view with another camera"
-    lags = {pair: offsets[pair[1]] - offsets[pair[0]] for pair in own}
-    shared = max(float(np.interp(lags[pair], curve.lags, curve.common)) for pair, curve in own.items())
-    alike = float(np.mean([np.interp(lags[pair], curve.lags, curve.correlation[0]) for pair, curve in own.items()]))
-    if shared < FEWEST:
-        return f"it shares {shared:.0f} frames with the others, fewer than {FEWEST}"
-    if alike < ALIKE:
-        return f"what moves in it does not move in the others (correlation {alike:.2f})"
-    top = int(np.abs(places - offsets[name]).argmin())
-    rival = _rival(total, top)
-    if rival is not None and total[rival] > RIVAL * total[top]:
-        frames = (places[rival] - places[top]) / FINE
-        return f"an offset that differs by {frames:+.1f} frames is as good (is the motion repeated?)"
+def _doubt(
+    name: str, offsets: Mapping[str, float], curves: Mapping[tuple[str, str], Curve], scores: Scores, frame: float
+) -> str:
+    """Why a camera's offset cannot be trusted, or nothing; `frame` is in steps."""
+    total = _alone(name, offsets, scores)
+    top = int(np.abs(_lags(total) - offsets[name]).argmin())
+    if total[top] < SURE**2:
+        said = f"{np.sqrt(total[top]):.1f} standard deviations, {SURE:g} are asked"
+        return f"what moves in it hardly agrees with the others ({said})"
+    repeated = {}  # what the scores would be if as large a share of the matches agreed at all lags as does at the best
+    for pair, score in scores.items():
+        lag, lags, count = offsets[pair[1]] - offsets[pair[0]], _lags(score), curves[pair].could[0]
+        repeated[pair] = np.interp(lag, lags, score) * count / max(np.interp(lag, lags, count), 1e-9)
+    best, likely = np.sqrt(total), np.sqrt(_alone(name, offsets, repeated))
+    rivals = _outside(total, top) & (best > RIVAL) & (best > likely - RIVAL)
+    if rivals.any():
+        apart = (int(np.where(rivals, total, 0).argmax()) - top) / frame
+        return f"an offset that differs by {apart:+.1f} frames is as good (is the motion repeated?)"
     return ""
 
 
-def _rival(total: np.ndarray, top: int) -> int | None:
-    """The best place outside of the peak at `top`: beyond where the curve has fallen to half and rises again."""
+def _outside(total: np.ndarray, top: int) -> np.ndarray:
+    """What is outside of the peak at `top` [L]: beyond where the curve has fallen and rises again."""
     outside = np.ones(len(total), bool)
     for way in (-1, 1):
         place, lowest = top, total[top]
@@ -224,105 +274,55 @@ def _rival(total: np.ndarray, top: int) -> int | None:
             lowest = min(lowest, total[place])
             outside[place] = False
             place += way
-    return int(np.where(outside, total, -np.inf).argmax()) if outside.any() else None
+    return outside
 
 
-def changes_of(one: Watched) -> tuple[np.ndarray, np.ndarray]:
-    """(change per second [T - 1, h, w] beyond what is usual for the pixel, the instants [T - 1] in the middle)."""
-    steps = np.diff(one.times)
-    still = np.median(one.images, axis=0) + 1
-    gains = np.median((one.images + 1.0) / still, axis=(1, 2), keepdims=True)
-    change = np.abs(np.diff(one.images / gains, axis=0)).astype(np.float32)
-    usual = np.median(change, axis=0)
-    change = np.maximum(change - NOISE[0] * usual - NOISE[1], 0) * (np.median(steps) / steps)[:, None, None]
-    return change.astype(np.float32), (one.times[1:] + one.times[:-1]) / 2
+def curve_between(one: Watched, other: Watched, step: float, search: float) -> Curve:
+    """How many matches of two cameras agree at each lag.
+
+    Each match tells of lags within a frame of how far its images are apart by their stamps, those next to that most.
+    """
+    frame, size = max(one.frame, other.frame), max(int(np.ceil(search / step)), FINE)
+    lags = np.arange(-size, size + 1)
+    apart, off, own, others, group = _matches(one, other, search + frame)
+    slope = (others - own) / 2  # pixels per second by which it leaves its line where the other clock began later
+    # What is one thing stays on its line from one instant to the next, so the two ends cross it alike.
+    unlike = (others + own) / 2 * frame / (0.5 + np.abs(slope) * frame / 4)
+    tells = (slope * frame) ** 2 / ((slope * frame) ** 2 + NEAR**2)
+    agree, count = np.zeros((GROUPS, len(lags))), np.zeros((GROUPS, len(lags)))
+    first = np.ceil((apart - frame) / step).astype(int)
+    for k in range(int(2 * frame / step) + 1):
+        place, later = first + k + size, (first + k) * step - apart
+        inside = (place >= 0) & (place < len(lags))
+        weight = np.maximum(1 - np.abs(later) / frame, 0) * tells
+        alike = weight * np.exp(-0.5 * (((off - slope * later) / NEAR) ** 2 + unlike**2))
+        np.add.at(agree, (group[inside], place[inside]), alike[inside])
+        np.add.at(count, (group[inside], place[inside]), weight[inside])
+    kept = np.concatenate([np.ones((1, GROUPS)), 1 - np.eye(GROUPS)])  # all, then without each group
+    begun, ended = (other.times[place] + lags * step for place in (0, -1))
+    common = np.minimum(one.times[-1], ended) - np.maximum(one.times[0], begun) > (LEAST_COMMON - 1.5) * frame
+    curve = Curve(kept @ agree * common, kept @ count * common)
+    excess = curve.excess(0)[curve.could[0] > 1]
+    wide = 1.4826 * float(np.median(np.abs(excess - np.median(excess)))) if len(excess) else 1.0
+    return curve._replace(spread=max(wide, 1.0))
 
 
-def curve_between(
-    one: Watched, other: Watched, changes: tuple, other_changes: tuple, step: float, search: float
-) -> Curve | None:
-    """The agreement of two cameras over the lag; None where no half-plane is in both images."""
-    angles = _angles(one.camera, other.camera)
-    if not all(np.isfinite(angle).any() for angle in angles):  # cameras at one place: no line joins them
-        return None
-    low, high = (
-        pick(float(np.nanquantile(angle, share)) for angle in angles) for pick, share in ((max, 0.01), (min, 0.99))
-    )
-    if not high > low:
-        return None
-    profiles = [
-        _resampled(_profile(change, angle, low, high), times, step)
-        for (change, times), angle in zip((changes, other_changes), angles)
-    ]
-    starts = (float(changes[1][0]), float(other_changes[1][0]))
-    return _correlated(profiles[0], profiles[1], starts, step, search)
-
-
-def _angles(one: Camera, other: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Angle [h, w] of each pixel's half-plane around the line that joins the cameras; NaN next to that line."""
-    axis = other.centre - one.centre
-    axis /= np.linalg.norm(axis) + 1e-300
-    ahead = one.T_camera_world[2, :3] + other.T_camera_world[2, :3]
-    ahead = ahead - axis * (axis @ ahead)
-    if np.linalg.norm(ahead) < 1e-6:  # the cameras look at each other: any direction across the line will do
-        ahead = np.cross(axis, one.T_camera_world[0, :3])
-    ahead /= np.linalg.norm(ahead)
-    across = np.cross(axis, ahead)
-
-    def of(camera: Camera) -> np.ndarray:
-        x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-        rays = np.stack([x, y, np.ones_like(x)], axis=-1) @ np.linalg.inv(camera.K).T @ camera.T_camera_world[:3, :3]
-        off = np.hypot(rays @ ahead, rays @ across) / np.linalg.norm(rays, axis=-1)
-        return np.where(off > 0.1, np.arctan2(rays @ across, rays @ ahead), np.nan)
-
-    return of(one), of(other)
-
-
-def _profile(change: np.ndarray, angles: np.ndarray, low: float, high: float) -> np.ndarray:
-    """Mean change [T, PLANES] of the pixels of each half-plane."""
-    with np.errstate(invalid="ignore"):
-        place = np.floor((angles - low) / (high - low) * PLANES)
-        inside = (place >= 0) & (place < PLANES)
-    places = place[inside].astype(int)
-    pixels = np.maximum(np.bincount(places, minlength=PLANES), 1)
-    rows = change[:, inside]
-    return np.stack([np.bincount(places, row, minlength=PLANES) for row in rows]) / pixels
-
-
-def _resampled(profile: np.ndarray, times: np.ndarray, step: float) -> np.ndarray:
-    """The profile [N, PLANES] every `step` seconds from its first instant on, linear between."""
-    wanted = np.arange(times[0], times[-1] + step / 2, step)
-    after = np.clip(np.searchsorted(times, wanted), 1, len(times) - 1)
-    share = ((wanted - times[after - 1]) / (times[after] - times[after - 1])).clip(0, 1)[:, None]
-    return profile[after - 1] * (1 - share) + profile[after] * share
-
-
-def _correlated(one: np.ndarray, other: np.ndarray, starts: tuple[float, float], step: float, search: float) -> Curve:
-    """The correlation over the common time at every lag, about the means of that time."""
-    a, b = len(one), len(other)
-    shifts = np.arange(-(b - 1), a)  # sample i + shift of `one` meets sample i of `other`
-    begin, end = np.maximum(shifts, 0), np.minimum(a, b + shifts)
-    count = end - begin
-    size = 1 << int(np.ceil(np.log2(a + b)))
-    spectra = np.fft.rfft(one, size, axis=0) * np.conj(np.fft.rfft(other, size, axis=0))
-    product = np.fft.irfft(spectra, size, axis=0)[shifts % size]
-    sums, squares = zip(*(_running(one, begin, end), _running(other, begin - shifts, end - shifts)))
-    group = np.arange(PLANES) * GROUPS // PLANES
-    kept = np.concatenate([np.ones((1, PLANES)), group != np.arange(GROUPS)[:, None]])  # all, then without each group
-    product = kept @ (product - sums[0] * sums[1] / count[:, None]).T
-    spreads = [kept @ (square - total**2 / count[:, None]).T for square, total in zip(squares, sums)]
-    size = np.sqrt((spreads[0] * spreads[1]).clip(0))
-    known = (count >= LEAST_COMMON * FINE) & (size > 1e-9)
-    correlation = np.where(known, product / np.where(known, size, 1), 0.0)
-    lags = shifts + (starts[0] - starts[1]) / step
-    near = np.abs(lags) <= search / step + 1
-    return Curve(lags[near], correlation[:, near], count[near] / FINE)
-
-
-def _running(values: np.ndarray, begin: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Sums of the values, and of their squares, from `begin` to `end`."""
-    both = []
-    for power in (values, values**2):
-        total = np.vstack([np.zeros((1, power.shape[1])), np.cumsum(power, axis=0)])
-        both.append(total[end] - total[begin])
-    return both[0], both[1]
+def _matches(one: Watched, other: Watched, search: float) -> tuple[np.ndarray, ...]:
+    """Of each match [n]: seconds between the stamps, pixels from its line, how fast each end leaves it, its group."""
+    a, b = one.camera, other.camera
+    own, others = ([place for place, found in enumerate(w.moving) if len(found.pixels)] for w in (one, other))
+    found = [np.zeros((0, 9))]
+    for i in spread(own, MOST_ANCHORS) if own else ():
+        for j in others:
+            here, there, apart = one.moving[i], other.moving[j], one.times[i] - other.times[j]
+            alike = here.descriptors @ there.descriptors.T
+            best = (alike == alike.max(axis=0)) | (alike == alike.max(axis=1, keepdims=True))
+            k, m = np.nonzero(best & (alike > ALIKE) & (abs(apart) <= search))
+            ends = here.pixels[k], here.velocities[k], there.pixels[m], there.velocities[m]
+            found.append(np.column_stack([np.full(len(k), apart), *ends]))
+    both = np.concatenate(found)
+    p, v, q, w = (both[:, c : c + 2] for c in (1, 3, 5, 7))
+    off, soon = sampson(a, b, p, q), max(one.frame, other.frame) / 4
+    leaves = (sampson(a, b, p + v * soon, q) - off) / soon, (sampson(a, b, p, q + w * soon) - off) / soon
+    cells = np.floor(p / (a.width, a.height) * GROUPS).astype(int)
+    return both[:, 0], off, *leaves, (cells[:, 0] + 3 * cells[:, 1]) % GROUPS

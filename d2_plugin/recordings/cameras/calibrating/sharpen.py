@@ -10,6 +10,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import cache
+from itertools import permutations
 
 import numpy as np
 
@@ -31,6 +33,8 @@ FINER, FINEST = 4, 4096
 """Images are enlarged this often before they are sampled, up to so many pixels along a side: OpenCV places samples at
 thirty-seconds of a pixel."""
 
+Fine = tuple[np.ndarray, int]  # a smooth image some times as large, how many times
+
 
 def sharpened(
     features: Mapping[str, Features], tracks: Tracks, cameras: Mapping[str, Camera]
@@ -39,39 +43,42 @@ def sharpened(
 
     Features without images stay as they are.
     """
-    if any(features[name].greys is None for name in tracks.names):
+    greys = {name: features[name].greys or () for name in tracks.names}
+    if not all(greys.values()):
         return dict(features), tracks
     moved = {name: features[name].pixels.copy() for name in tracks.names}
     seen = tracks.seen.copy()
     order = np.argsort(-(seen >= 0).sum(axis=0), kind="stable")  # the camera that sees most keeps its places
     first = order[(seen[:, order] >= 0).argmax(axis=1)]
-    for one in range(len(tracks.names)):
-        for other in range(len(tracks.names)):
-            rows = np.flatnonzero((first == one) & (seen[:, other] >= 0)) if one != other else np.zeros(0, int)
+    moments = np.array([features[tracks.names[one]].moments[own[one]] for one, own in zip(first, seen)], int)
+    for moment in np.unique(moments):
+        fine = cache(lambda name, moment=moment: _enlarged(greys[name][moment]))
+        for one, other in permutations(range(len(tracks.names)), 2):
+            rows = np.flatnonzero((moments == moment) & (first == one) & (seen[:, other] >= 0))
             if len(rows):
                 names = tracks.names[one], tracks.names[other]
                 limit = LARGEST_MOVE * pixel_error(cameras[names[1]])
-                places, good = _moved(features[names[0]], features[names[1]], seen[rows][:, [one, other]], limit)
+                pairs = seen[rows][:, [one, other]]
+                places, good = _moved(
+                    features[names[0]], features[names[1]], pairs, fine(names[0]), fine(names[1]), limit
+                )
                 moved[names[1]][seen[rows, other]] = places
                 seen[rows[~good], other] = -1
     better = {name: replace(features[name], pixels=moved[name]) for name in tracks.names}
     return {**features, **better}, Tracks(tracks.names, seen[(seen >= 0).sum(axis=1) >= 2])
 
 
-def _moved(one: Features, other: Features, pairs: np.ndarray, limit: float) -> tuple[np.ndarray, np.ndarray]:
-    """(places [n, 2] in `other` of the pairs [n, 2], whether each of them can be believed)."""
-    places, good = other.pixels[pairs[:, 1]].copy(), np.zeros(len(pairs), bool)
-    assert one.greys is not None
-    assert other.greys is not None
-    moments, fixed = one.moments[pairs[:, 0]], one.shapes[pairs[:, 0], 0] == 0  # corners of a board stay
-    good[fixed] = True
-    for moment in np.unique(moments[~fixed]):
-        rows = np.flatnonzero((moments == moment) & ~fixed)
+def _moved(
+    one: Features, other: Features, pairs: np.ndarray, fine: Fine, other_fine: Fine, limit: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """(places [n, 2] in `other` of the pairs [n, 2] of one moment, whether each of them can be believed)."""
+    places, good = other.pixels[pairs[:, 1]].copy(), one.shapes[pairs[:, 0], 0] == 0  # corners of a board stay
+    rows = np.flatnonzero(~good)
+    if len(rows):
         start, begin = one.pixels[pairs[rows, 0]], places[rows]
         warp = _similarity(one.shapes[pairs[rows, 0]], other.shapes[pairs[rows, 1]])
-        ends, alike, step = _matched(one.greys[moment], other.greys[moment], start, begin, warp)
-        near = np.linalg.norm(ends - begin, axis=1) < limit
-        good[rows] = near & (alike > ALIKE) & (step < STILL)
+        ends, alike, step = _matched(fine, other_fine, start, begin, warp)
+        good[rows] = (np.linalg.norm(ends - begin, axis=1) < limit) & (alike > ALIKE) & (step < STILL)
         places[rows] = np.where(good[rows, None], ends, begin)
     return places, good
 
@@ -84,24 +91,23 @@ def _similarity(one: np.ndarray, other: np.ndarray) -> np.ndarray:
 
 
 def _matched(
-    grey: np.ndarray, other: np.ndarray, p: np.ndarray, q: np.ndarray, warp: np.ndarray
+    fine: Fine, other: Fine, p: np.ndarray, q: np.ndarray, warp: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(places [n, 2] in `other`, correlations [n], last steps [n]) for places p, starting at q."""
     grid = np.arange(-RADIUS, RADIUS + 1.0)
     u = np.stack(np.meshgrid(grid, grid), axis=-1).reshape(-1, 2)
     weight = np.exp(-(u**2).sum(axis=1) / (2 * WIDTH**2))
-    fine, other_fine = _enlarged(grey), _enlarged(other)
     patch = _sampled(fine, p[:, None] + u)
     inverse = _normal(patch, u, weight)
     step = np.full(len(p), np.inf)
     for _ in range(ROUNDS):
-        there = _sampled(other_fine, q[:, None] + u @ warp.transpose(0, 2, 1))
+        there = _sampled(other, q[:, None] + u @ warp.transpose(0, 2, 1))
         change = np.einsum("nij,nj->ni", inverse, there)
         affine = np.linalg.inv(np.eye(2) + np.clip(change[:, 2:6], -0.2, 0.2).reshape(-1, 2, 2))
         warp = warp @ affine
         move = -(warp @ np.clip(change[:, :2], -1, 1)[..., None])[..., 0]
         q, step = q + move, np.linalg.norm(move, axis=1)
-    there = _sampled(other_fine, q[:, None] + u @ warp.transpose(0, 2, 1))
+    there = _sampled(other, q[:, None] + u @ warp.transpose(0, 2, 1))
     return q, _correlation(patch, there, weight), step
 
 
@@ -119,15 +125,14 @@ def _normal(patch: np.ndarray, u: np.ndarray, weight: np.ndarray) -> np.ndarray:
     return np.asarray(np.linalg.solve(conditioned, weighted / size[:, :, None]) / size[:, :, None])
 
 
-def _enlarged(grey: np.ndarray) -> tuple[np.ndarray, int]:
-    """(a smooth image some times as large, how many times)."""
+def _enlarged(grey: np.ndarray) -> Fine:
     cv2 = opencv("calibrating from images", "calibration")
     times = max(min(FINER, FINEST // max(grey.shape)), 1)
     smooth = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), 0.7)
     return cv2.resize(smooth, None, fx=times, fy=times, interpolation=cv2.INTER_CUBIC), times
 
 
-def _sampled(fine: tuple[np.ndarray, int], places: np.ndarray) -> np.ndarray:
+def _sampled(fine: Fine, places: np.ndarray) -> np.ndarray:
     """Brightness [n, m] at pixels [n, m, 2] of the image before it was enlarged, centres at i + 0.5."""
     cv2 = opencv("calibrating from images", "calibration")
     image, times = fine
