@@ -32,7 +32,7 @@ def run(given: Given) -> None:
 def described(recording: Recording) -> str:
     """Name, layout, cameras, frames and size of the images, in one line."""
     cameras, frames = list(recording.cameras), recording.frames
-    sizes = _each(f"{camera.width}x{camera.height}" for camera in recording.cameras.values())
+    sizes = " or ".join(dict.fromkeys(f"{camera.width}x{camera.height}" for camera in recording.cameras.values()))
     when = f"frames {frames[0]} to {frames[-1]} ({len(frames)})" if len(frames) > 1 else f"frame {frames[0]}"
     who = f"{len(cameras)} camera{'' if len(cameras) == 1 else 's'} ({', '.join(cameras)})"
     when += f" at {recording.rate:g} per second"
@@ -46,7 +46,3 @@ def _clock(recording: Recording) -> Iterable[str]:
         yield f"cameras expose up to {max(late):.2f} frames apart; each image is trained at its own instant"
     elif len(recording.frames) > 1 and not Path(recording.path or "", "import", "clocks.json").is_file():
         yield "nothing says how the cameras were synchronised: equal frame numbers are taken as one instant"
-
-
-def _each(values: Iterable[str]) -> str:
-    return " or ".join(dict.fromkeys(values))

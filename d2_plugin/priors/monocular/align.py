@@ -195,7 +195,7 @@ def _twice_the_ranks(values: np.ndarray) -> np.ndarray:
 def _depth(mono: np.ndarray, scale: float, shift: float, kind: MonoKind, z_far: float) -> np.ndarray:
     value: np.ndarray = scale * np.where(predicted(mono), mono, np.nan) + shift
     if kind == "relative":
-        near_enough = value > _nearest(z_far)
+        near_enough = value > max(1 / z_far, float(np.finfo(np.float32).tiny))
         return np.where(near_enough, 1 / np.where(near_enough, value, 1), 0)
     return np.where((value > 0) & (value <= z_far), value, 0)
 
@@ -231,11 +231,6 @@ def _fitted(mono: np.ndarray, geometric: np.ndarray, kind: MonoKind, settings: A
     epsilon = settings.epsilon if relative else settings.epsilon * float(np.median(target))
     fit = fit_affine(x, target, 1 / target if relative else None, epsilon=epsilon)
     return _Fitted(count, x, depth, target, fit, epsilon)
-
-
-def _nearest(z_far: float) -> float:
-    """The inverse depth of z_far, or what float32 can hold of it."""
-    return max(1 / z_far, float(np.finfo(np.float32).tiny))
 
 
 def _judge(fit: AffineFit, correlation: float, t: float, inliers: float, settings: AlignSettings) -> AlignStatus:

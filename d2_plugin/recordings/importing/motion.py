@@ -40,9 +40,7 @@ BACK = 0.5  # pixels by which a feature that is followed to the next frame and b
 ALIKE = 0.7  # product of two descriptors that may show the same thing
 NEAR = 0.7  # pixels, standard deviation of a match from its epipolar line
 SURE = 4.0  # standard deviations by which each camera's best lag must stand out; by chance one in 30,000 lags does
-RIVAL = (
-    3.0  # the same of other lags that are looked at, and by which they must be worse than motion that repeats itself
-)
+RIVAL = 3.0  # the same of other lags, and by which they must be worse than motion that repeats itself
 VAGUE = 0.7  # frames of standard error from which motion says nothing
 LEAST_ERROR = 0.15  # frames: what a good calibration is wrong by is half a pixel
 GROUPS = 8  # parts of the image
