@@ -63,10 +63,6 @@ def steps_between_evaluations(iterations: int, least: int) -> int:
     return max(least, min(100, iterations // 20))
 
 
-def _none_known(_: str) -> Sequence[View]:
-    return ()
-
-
 class Surveyed(NamedTuple):
     """One view of an evaluation: its sliced Gaussians, its prior, and the compositing weights."""
 
@@ -88,7 +84,7 @@ class Context:
     generator: torch.Generator
     sample: Callable[[], Sequence[View]] = field(default=tuple)
     """The views to evaluate when structure is edited: a stratified sample of all training views."""
-    instants: Callable[[str], Sequence[View]] = _none_known
+    instants: Callable[[str], Sequence[View]] = field(default=lambda camera: ())
     """The views of a camera that were trained on so far, in the order in which they were first seen."""
     inserts_halfway: bool = False
     """Whether `halfway` is evaluated as well."""
