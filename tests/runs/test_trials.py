@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,8 +25,7 @@ from d2_plugin.runs.settings import RunSettings
 from d2_plugin.runs.start import TimedPoints
 from d2_plugin.store.store import PriorStore
 
-DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
-NETWORK = DATA / "weights" / "mobile_pydnet.onnx"
+NETWORK = "mobile_pydnet.onnx"
 CAMERAS, WIDTH, HEIGHT = 3, 160, 90
 NO_POINTS = TimedPoints(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
 GOOD, BAD = Score(0.8, 24.0), Score(0.7, 25.0)
@@ -219,14 +219,18 @@ RECORDINGS = [
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "cameras", "frames", "network", "choice"), RECORDINGS, ids=[r[0] for r in RECORDINGS])
 def test_the_choice_is_that_of_full_runs(
-    tmp_path: Path, name: str, cameras: tuple[str, ...], frames: tuple[int, ...], network: Path | None, choice: str
+    shared_data: Callable[[str], Path],
+    tmp_path: Path,
+    name: str,
+    cameras: tuple[str, ...],
+    frames: tuple[int, ...],
+    network: str | None,
+    choice: str,
 ) -> None:
     """Held-out cameras after 2000 steps: on dome stereo alone is 1.2 dB above the whole prior; on studio and plaza
     the whole prior is 3.1 and 5.3 dB above stereo alone."""
-    if not (DATA / name).is_dir():
-        pytest.skip(f"shared/data/{name} is not here")
-    mono = {} if network is None else {"mono_onnx": str(network), "mono_kind": "relative"}
-    settings = RunSettings(str(DATA / name), cameras, frames=frames, **mono)
+    mono = {} if network is None else {"mono_onnx": str(shared_data("weights") / network), "mono_kind": "relative"}
+    settings = RunSettings(str(shared_data(name)), cameras, frames=frames, **mono)
     run = Run(settings, tmp_path / "run")
     points = run.prepare()
     scene = run.scene.with_points(points, settings)
