@@ -37,10 +37,8 @@ def _over(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
     """`above` over `below`, table by table."""
     merged = dict(below)
     for name, value in above.items():
-        both = isinstance(value, dict) and isinstance(merged.get(name), dict)
-        merged[name] = Config(_over(merged[name], value)) if both else _as_config(value)
+        inner = merged.get(name)
+        if isinstance(value, dict):
+            value = Config(_over(inner if isinstance(inner, dict) else {}, value))
+        merged[name] = value
     return merged
-
-
-def _as_config(value: Any) -> Any:
-    return Config(_over({}, value)) if isinstance(value, dict) else value

@@ -158,7 +158,9 @@ def measured_skill(
     compared, alone = (float(np.median(np.concatenate(each))) for each in (errors[:COMPARED], without))
     all_ratios, error = np.concatenate(ratios), float(np.median(np.concatenate(errors)))
     scale = _scale(all_ratios, int(np.count_nonzero(anchors)))
-    return Skill(scale, error, alone / max(compared, np.finfo(float).tiny), _tail(all_ratios, scale))
+    # How far errors in units of their shape go beyond the usual ones of that scale.
+    tail = float(max(np.quantile(all_ratios, IN_TAIL) / (USUAL_TAIL * scale), 1))
+    return Skill(scale, error, alone / max(compared, np.finfo(float).tiny), tail)
 
 
 def error_shape(depth: np.ndarray, anchors: np.ndarray, at: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
@@ -217,11 +219,6 @@ def _count(masks: np.ndarray) -> np.ndarray:
 def _log_error(depth: np.ndarray, anchors: np.ndarray, place: np.ndarray) -> np.ndarray:
     """|log(depth / anchor)| [n] at pixels that are given by flat index."""
     return np.abs(np.log(depth.ravel()[place] / anchors.ravel()[place]))
-
-
-def _tail(ratios: np.ndarray, scale: float) -> float:
-    """How far errors in units of their shape go beyond the usual ones of that scale, 1 at least."""
-    return float(max(np.quantile(ratios, IN_TAIL) / (USUAL_TAIL * scale), 1))
 
 
 def _scale(ratios: np.ndarray, anchors: int) -> float:
