@@ -65,13 +65,10 @@ def share(settings: RunSettings, folder: Path, cluster: Mapping[str, Any] | None
     points = share_points(settings, folder)
     if not _record(shared.priors).is_file():
         scene, known = Scene.open(check(replace(settings, hooks=HOOK_NAMES))), TimedPoints.load(points)
-
-        def make() -> None:
-            summary = build_priors_for(scene, known.positions, shared.priors, cluster=cluster)
-            if summary.usable and can_decide(scene):
-                tried(settings, scene, known, shared.priors)
-
-        _timed(shared.priors, make, time.process_time if cluster is None else time.monotonic)
+        clock = time.process_time if cluster is None else time.monotonic
+        _timed(shared.priors, lambda: build_priors_for(scene, known.positions, shared.priors, cluster=cluster), clock)
+        if can_decide(scene):
+            tried(settings, scene, known, shared.priors)  # counted with the runs that use it
     return shared
 
 

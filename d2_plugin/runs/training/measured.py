@@ -90,7 +90,7 @@ def _metrics(work: Work) -> dict[str, Any]:
 
 
 def _row(work: Work, metrics: Mapping[str, Any] | None, failed: str | None = None) -> Row:
-    """A run as a row."""
+    """A run as a row; trials that decided what of the prior is used count as time of the prior."""
     settings, error, measured = work.settings, None, dict[str, Any]()
     about: dict[str, Any] = {"target": work.target, "iterations": settings.iterations, "seed": settings.seed}
     about |= {"cameras": list(settings.train_cameras), **work.about, "fingerprint": fingerprint(work)}
@@ -100,6 +100,8 @@ def _row(work: Work, metrics: Mapping[str, Any] | None, failed: str | None = Non
         failed = None if error is not None else "no camera was held out"
         measured = {name: metrics[name] for name in ("gaussians", "background", "mono_emulated")}
         measured |= {"scores": scores, "wall_seconds": metrics["seconds"]["train"]}
+        if metrics.get("trials") and about.get("prior_seconds") is not None:
+            about["prior_seconds"] += metrics["trials"]["cpu_seconds"]
     return make_row(
         work.kind,
         work.case,
