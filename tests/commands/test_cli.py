@@ -116,11 +116,15 @@ def test_priors_are_built_in_parts_and_shown_on_a_sheet(
     build = ["priors", str(recording), "--train-cameras", CAMERAS, "--output", str(tmp_path)]
     assert main([*build, "--shard", "2/2"]) == 0
     assert not (tmp_path / "contact_sheet.png").exists()
-    assert "held against" not in capsys.readouterr().out, "a part is not the whole"
+    told = capsys.readouterr().out
+    assert "held against" not in told, "a part is not the whole"
+    assert "here monocular depth" not in told, "and is not tried out"
     assert main(build) == 0
     told = capsys.readouterr().out
     assert "verified" in told
     assert "held against the true depth of" in told
+    assert "here monocular depth is" in told, "what left-out cameras showed, for every trainer that reads this prior"
+    assert PriorStore.open(tmp_path).tried()["text"] in told
     assert (tmp_path / "contact_sheet.png").is_file()
     whole, joined = PriorStore.open(finished / "priors"), PriorStore.open(tmp_path)
     for camera in CAMERAS.split(","):
