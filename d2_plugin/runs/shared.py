@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from d2_plugin.durable import Kind, make_folder, read_table, write_table
+from d2_plugin.priors.summary import PriorSummary
 from d2_plugin.runs.prior.build import build_priors_for
 from d2_plugin.runs.prior.trials import can_decide, tried
 from d2_plugin.runs.scene import Scene
@@ -66,9 +67,15 @@ def share(settings: RunSettings, folder: Path, cluster: Mapping[str, Any] | None
     if not _record(shared.priors).is_file():
         scene, known = Scene.open(check(replace(settings, hooks=HOOK_NAMES))), TimedPoints.load(points)
         clock = time.process_time if cluster is None else time.monotonic
-        _timed(shared.priors, lambda: build_priors_for(scene, known.positions, shared.priors, cluster=cluster), clock)
-        if can_decide(scene):
-            tried(settings, scene, known, shared.priors)  # counted with the runs that use it
+
+        def build() -> PriorSummary:
+            return build_priors_for(scene, known.positions, shared.priors, cluster=cluster)
+
+        def try_out(summary: PriorSummary) -> None:
+            if summary.usable and can_decide(scene):
+                tried(settings, scene, known, shared.priors)  # counted with the runs that use it
+
+        _timed(shared.priors, build, clock, try_out)
     return shared
 
 
@@ -76,9 +83,16 @@ def _record(made: Path) -> Path:
     return Path(f"{made}.seconds.json")
 
 
-def _timed(made: Path, make: Callable[[], Any], clock: Callable[[], float] = time.process_time) -> None:
-    """Make it, and record beside it what that took, where nothing of it was there before."""
+def _timed(
+    made: Path,
+    make: Callable[[], Any],
+    clock: Callable[[], float] = time.process_time,
+    then: Callable[[Any], None] = lambda result: None,
+) -> None:
+    """Make it and do what comes `then`; record beside it what making took, where nothing of it was there before."""
     make_folder(made.parent)
     whole, start = not made.exists(), clock()
-    make()
-    write_table(_record(made), {"seconds": clock() - start if whole else None}, COST)
+    result = make()
+    seconds = clock() - start
+    then(result)
+    write_table(_record(made), {"seconds": seconds if whole else None}, COST)
