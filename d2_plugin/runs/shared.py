@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -67,9 +68,7 @@ def share(settings: RunSettings, folder: Path, cluster: Mapping[str, Any] | None
     if not _record(shared.priors).is_file():
         scene, known = Scene.open(check(replace(settings, hooks=HOOK_NAMES))), TimedPoints.load(points)
         clock = time.process_time if cluster is None else time.monotonic
-
-        def build() -> PriorSummary:
-            return build_priors_for(scene, known.positions, shared.priors, cluster=cluster)
+        build = partial(build_priors_for, scene, known.positions, shared.priors, cluster=cluster)
 
         def try_out(summary: PriorSummary) -> None:
             if summary.usable and can_decide(scene):

@@ -48,10 +48,9 @@ class RenamedStore:
         known = getattr(self.store, "cameras", None)
         return tuple(name for name, source in self.sources.items() if known is None or source in known)
 
-    def tried(self) -> dict[str, Any] | None:
+    def tried(self) -> Any:
         """See `PriorStore.tried`."""
-        found: dict[str, Any] | None = call_optional(self.store, "tried")
-        return found
+        return call_optional(self.store, "tried")
 
     def prior(self, camera: str, frame: int) -> DepthPrior | None:
         """D* of one view, or None where there is none; a camera that the export does not have is refused."""

@@ -204,9 +204,8 @@ class PriorStore:
     @property
     def contents(self) -> str:
         """Hash of what all these priors were built from."""
-        return hash_of(
-            [(self.record(camera, frame) or {}).get("key") for camera in self.cameras for frame in self.frames]
-        )
+        records = (self.record(camera, frame) or {} for camera in self.cameras for frame in self.frames)
+        return hash_of([record.get("key") for record in records])
 
     def tried(self) -> dict[str, Any] | None:
         """What trials with these very priors showed, as `Trials.as_dict` has it; None where there were none."""

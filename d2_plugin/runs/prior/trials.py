@@ -113,12 +113,10 @@ def can_decide(scene: Scene) -> bool:
 def tried(settings: RunSettings, scene: Scene, points: TimedPoints, priors: Path) -> dict[str, Any]:
     """What trials with the prior in the folder `priors` show, as `Trials.as_dict` has it.
 
-    They are made once, the same whatever else a run has (the default backbone with all hooks), and lie beside the prior
-    for every trainer.
+    They are made once, with the default backbone and all hooks, and lie beside the prior for every trainer.
     """
     store = PriorStore.open(priors)
-    known = store.tried()
-    if known is not None:
+    if (known := store.tried()) is not None:
         return known
     plain = {name: table for name, table in settings.overrides.items() if name in ("plan", "priors")}
     own = replace(settings, backbone=RunSettings.backbone, hooks=HOOK_NAMES, seed=0, overrides=plain)
