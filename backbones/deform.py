@@ -1,7 +1,7 @@
 """Canonical Gaussians and a deformation field: one set of 3D Gaussians, moved, turned and scaled at each instant.
 
-`field = "mlp"` is in the style of Deformable-3D-Gaussians, `field = "hexplane"` of 4DGaussians; where the scene has one
-instant or no motion the field is left out (`temporal=False`) and these are ordinary 3D Gaussians.
+The field is in the style of 4DGaussians; where the scene has one instant or no motion it is left out (`temporal=False`)
+and these are ordinary 3D Gaussians.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import dataclasses
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -23,7 +23,7 @@ from d2_plugin.gaussians.slicing import LOG_SCALE_LIMIT, MARGINAL_CUT, rows_to_d
 from d2_plugin.rasterizer import Splats, View
 from d2_plugin.settings import Seed
 
-from .deform_fields import Box, Field, HexPlaneField, HexPlaneSettings, MlpField, MlpSettings, Offsets
+from .deform_fields import Box, HexPlaneField, HexPlaneSettings, Offsets
 from .model import SplatModel, SplatSettings, decayed_rate
 from .starting import identity_quaternions, isotropic_rows
 from .trainer import Trainer, TrainSettings
@@ -44,14 +44,10 @@ FIELD_DECAY = 0.1
 class DeformSettings(SplatSettings):
     """Model and optimizers of the backbone."""
 
-    field: Literal["mlp", "hexplane"] = "hexplane"
-    """Kind of the deformation field."""
     seed: Seed = 0
     """Seed of the field's start and of the noise on time; the global random state is never used."""
-    mlp: MlpSettings = dataclasses.field(default_factory=MlpSettings)
-    """The network of a field of kind "mlp"."""
     hexplane: HexPlaneSettings = dataclasses.field(default_factory=HexPlaneSettings)
-    """The planes of a field of kind "hexplane"."""
+    """The planes of the field."""
 
 
 class Deform(SplatModel):
@@ -68,11 +64,11 @@ class Deform(SplatModel):
     def __init__(self, rows: Mapping[str, Tensor], settings: DeformSettings, extent: float, duration: float) -> None:
         super().__init__(rows, settings, extent, duration)
         self._generator = torch.Generator().manual_seed(settings.seed)
-        self.field: Field | None = None
+        self.field: HexPlaneField | None = None
         self._noise = 0.0
         if settings.temporal:
             box = Box.around(rows["positions"], extent)
-            self.field = make_field(settings, box, self._generator).to(rows["positions"])
+            self.field = HexPlaneField(box, settings.hexplane, self._generator).to(rows["positions"])
             self.field_optimizer = torch.optim.Adam(self.field.parameter_groups(), eps=1e-15, fused=True)
 
     @staticmethod
@@ -179,13 +175,6 @@ class Deform(SplatModel):
             self.field_optimizer.load_state_dict(state["field_optimizer"])
             self._generator.set_state(state["generator"].cpu())
             self._noise = state["noise"]
-
-
-def make_field(settings: DeformSettings, box: Box, generator: torch.Generator) -> Field:
-    """The field that `settings.field` names."""
-    if settings.field == "mlp":
-        return MlpField(box, settings.mlp, generator)
-    return HexPlaneField(box, settings.hexplane, generator)
 
 
 create, settings_from = Deform.create, Deform.settings_from

@@ -1,17 +1,15 @@
-"""Deformation fields: where a canonical Gaussian is, how it is turned and how large it is at an instant.
+"""The deformation field: where a canonical Gaussian is, how it is turned and how large it is at an instant.
 
-`MlpField` follows ingra14m/Deformable-3D-Gaussians (positional encoding, skip connection, linear heads),
-`HexPlaneField` hustvl/4DGaussians (six planes at several resolutions, multiplied, small head). Two things are ours:
-widths and grids are small enough for a CPU, and the last layer starts at zero, so that motion starts from none.
+After hustvl/4DGaussians: six planes at several resolutions, multiplied, and a small head. Two things are ours: grids
+are small enough for a CPU, and the last layer starts at zero, so that motion starts from none.
 
-A field is evaluated for all N Gaussians at one instant: what depends on the instant alone is computed once. No gradient
-flows from it to the positions (Deformable-3D-Gaussians detaches them too).
+It is evaluated for all N Gaussians at one instant: what depends on the instant alone is computed once. No gradient
+flows from it to the positions.
 """
 
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Annotated, Any, NamedTuple
 
@@ -37,8 +35,6 @@ class Offsets(NamedTuple):
     log_scales: Tensor  # [N, 3]
 
 
-POSITION_OCTAVES, TIME_OCTAVES = 6, 6
-"""Frequencies with which `MlpField` encodes positions and time. Official: 10, and 10 or 6."""
 HIDDEN = 64
 """Neurons of the hidden layer of `HexPlaneField`."""
 PLANE_RATE = 1e-2
@@ -46,18 +42,6 @@ PLANE_RATE = 1e-2
 SMOOTH_SPACE, SMOOTH_TIME, STILL = 2e-4, 1e-3, 1e-4
 """Weights of the planes' squared second differences in space and along time, and of |1 - plane| of those with time: a
 plane of ones changes nothing. Official names: plane_tv_weight, time_smoothness_weight, l1_time_planes."""
-
-
-@dataclass(frozen=True)
-class MlpSettings(Settings):
-    """Network of `MlpField`."""
-
-    width: Annotated[int, Range(1, 1024)] = 64
-    """Neurons of a hidden layer. Official: 256, on a GPU."""
-    depth: Annotated[int, Range(1, 16)] = 4
-    """Hidden layers, with a skip connection to the middle one. Official: 8."""
-    rate: LearningRate = 2e-3
-    """Learning rate of the network at the first step. Official: 8e-4."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +64,7 @@ class HexPlaneSettings(Settings):
 
 
 class Box(NamedTuple):
-    """The part of the world that a field is made for; `unit` is what its position offsets are measured in."""
+    """The part of the world that the field is made for; `unit` is what its position offsets are measured in."""
 
     centre: Tensor  # [3]
     reach: Tensor  # [3] half of each side
@@ -95,73 +79,18 @@ class Box(NamedTuple):
         return cls((low + high) / 2, 0.55 * (high - low).clamp(min=1e-3 * unit), unit)
 
 
-class Field(nn.Module, ABC):
-    """Offsets of Gaussians at one instant, from their canonical positions."""
+class HexPlaneField(nn.Module):
+    """Offsets of Gaussians at one instant, from their canonical positions: the product of six feature planes at each of
+    several resolutions, into a small network."""
 
     centre: Tensor
     reach: Tensor
 
-    def __init__(self, box: Box) -> None:
+    def __init__(self, box: Box, settings: HexPlaneSettings, generator: torch.Generator) -> None:
         super().__init__()
         self.register_buffer("centre", box.centre.detach().clone())
         self.register_buffer("reach", box.reach.detach().clone())
-        self.unit = box.unit
-
-    def forward(self, positions: Tensor, fraction: float) -> Offsets:
-        """Offsets of `positions` [N, 3] (world; no gradient) at `fraction` of the duration, clamped to 0..1."""
-        columns = self.columns((positions.detach() - self.centre) / self.reach, min(max(fraction, 0.0), 1.0))
-        place, turn, size = columns.split(SPLITS, -1)
-        return Offsets(self.unit * place, turn, size)
-
-    @abstractmethod
-    def columns(self, places: Tensor, fraction: float) -> Tensor:
-        """The last layer [N, 10] for places [N, 3] in units of the box, -1..1 inside."""
-
-    @abstractmethod
-    def parameter_groups(self) -> list[dict[str, Any]]:
-        """Groups for an optimizer: params, lr, name."""
-
-    def regularization(self) -> Tensor | float:
-        """A term of the training loss that keeps the field smooth."""
-        return 0.0
-
-
-class MlpField(Field):
-    """Positional encoding of place and time into a network with one skip connection."""
-
-    def __init__(self, box: Box, settings: MlpSettings, generator: torch.Generator) -> None:
-        super().__init__(box)
-        self.settings = settings
-        width, place, instant = settings.width, 3 * (1 + 2 * POSITION_OCTAVES), 1 + 2 * TIME_OCTAVES
-        hidden = settings.depth - 1
-        self.skip = hidden // 2
-        self.hidden = nn.ModuleList(linear(width, width, generator) for _ in range(hidden))
-        self.place = nn.ModuleList(linear(place, width, generator) for _ in range(2 if hidden else 1))
-        self.instant = nn.ModuleList(linear(instant, width, generator) for _ in self.place)
-        self.heads = zero_linear(width, sum(SPLITS))
-
-    def columns(self, places: Tensor, fraction: float) -> Tensor:
-        """See `Field.columns`; the encoded time enters as one row that all Gaussians share."""
-        place = octaves(places, POSITION_OCTAVES)
-        instant = octaves(places.new_tensor([2 * fraction - 1]), TIME_OCTAVES)
-        enters = [at_place(place) + at_time(instant) for at_place, at_time in zip(self.place, self.instant)]
-        state = F.relu(enters[0])
-        for i, layer in enumerate(self.hidden):
-            state = layer(state)
-            state = F.relu(state + enters[1] if i == self.skip else state)
-        return self.heads(state)
-
-    def parameter_groups(self) -> list[dict[str, Any]]:
-        """One group: the network."""
-        return [{"params": list(self.parameters()), "lr": self.settings.rate, "name": "network"}]
-
-
-class HexPlaneField(Field):
-    """The product of six feature planes at each of several resolutions, into a small network."""
-
-    def __init__(self, box: Box, settings: HexPlaneSettings, generator: torch.Generator) -> None:
-        super().__init__(box)
-        self.settings = settings
+        self.unit, self.settings = box.unit, settings
         channels, instants = settings.features, settings.instants
         grids = [torch.empty(3, channels, r, r).uniform_(0.1, 0.5, generator=generator) for r in settings.resolutions]
         self.space = nn.ParameterList(grids)
@@ -169,11 +98,15 @@ class HexPlaneField(Field):
         self.features = linear(channels * len(settings.resolutions), HIDDEN, generator)
         self.heads = zero_linear(HIDDEN, sum(SPLITS))
 
-    def columns(self, places: Tensor, fraction: float) -> Tensor:
-        """See `Field.columns`; outside the box the planes keep their border values."""
-        inside = places.clamp(-1, 1).T.contiguous()
-        levels = [self._level(space, time, inside, fraction) for space, time in zip(self.space, self.time)]
-        return self.heads(F.relu(self.features(torch.cat(levels).T)))
+    def forward(self, positions: Tensor, fraction: float) -> Offsets:
+        """Offsets of `positions` [N, 3] (world; no gradient) at `fraction` of the duration, clamped to 0..1.
+
+        Outside the box the planes keep their border values."""
+        places = (positions.detach() - self.centre) / self.reach
+        inside, instant = places.clamp(-1, 1).T.contiguous(), min(max(fraction, 0.0), 1.0)
+        levels = [self._level(space, time, inside, instant) for space, time in zip(self.space, self.time)]
+        place, turn, size = self.heads(F.relu(self.features(torch.cat(levels).T))).split(SPLITS, -1)
+        return Offsets(self.unit * place, turn, size)
 
     def parameter_groups(self) -> list[dict[str, Any]]:
         """Two groups: planes and network."""
@@ -200,12 +133,6 @@ class HexPlaneField(Field):
         moving = lines @ hats(places, lines.shape[-1])
         x, y, z = planes * moving  # xy with zt's partner and so on: the product of all six is what counts
         return x * y * z
-
-
-def octaves(values: Tensor, count: int) -> Tensor:
-    """[..., D * (1 + 2 count)]: the values, and sine and cosine of pi times 1, 2, 4, ... of each; values [..., D]."""
-    angles = (values[..., None] * (math.pi * 2.0 ** torch.arange(count, device=values.device))).flatten(-2)
-    return torch.cat([values, angles.sin(), angles.cos()], -1)
 
 
 def at_instant(planes: Tensor, fraction: float) -> Tensor:

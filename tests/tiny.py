@@ -10,7 +10,7 @@ from torch import Tensor
 from d2_plugin.adapters.deform import DeformAdapter
 from d2_plugin.adapters.yang4d import Yang4DAdapter
 from d2_plugin.backbones.deform import Deform, DeformSettings
-from d2_plugin.backbones.deform_fields import HexPlaneSettings, MlpSettings
+from d2_plugin.backbones.deform_fields import HexPlaneSettings
 from d2_plugin.backbones.densify import DensifySettings
 from d2_plugin.backbones.model import SplatModel
 from d2_plugin.backbones.trainer import Trainer, TrainSettings
@@ -20,8 +20,8 @@ from d2_plugin.plugin import D2Hooks
 from d2_plugin.protocol import DepthPrior, Label, View
 
 WIDTH, HEIGHT, DISTANCE = 32, 24, 3.0
-BACKBONES = ("yang4d", "mlp", "hexplane")
-"""The bundled backbones, the one with a deformation field once for each kind of field."""
+BACKBONES = ("yang4d", "deform")
+"""The bundled backbones."""
 
 
 def make_views() -> list[View]:
@@ -77,8 +77,7 @@ def make_model(
     if backbone == "yang4d":
         model = Yang4D.from_points(positions, colors, times, Yang4DSettings(**shared), extent=2.0, duration=0.5)
     else:
-        fields = {"mlp": MlpSettings(width=16, depth=3), "hexplane": HexPlaneSettings(features=4, resolutions=(4, 8))}
-        settings = DeformSettings(**shared, field=backbone, **fields)
+        settings = DeformSettings(**shared, hexplane=HexPlaneSettings(features=4, resolutions=(4, 8)))
         model = Deform.from_points(positions, colors, times, settings, extent=2.0, duration=0.5)
     with torch.no_grad():
         model.gaussians["opacity_logits"].zero_()  # opacity one half: enough to supervise depth from the first step

@@ -1,8 +1,7 @@
-"""The bundled deformation backbone: its two fields, where they are still, how they learn, what is left out."""
+"""The bundled deformation backbone: its field, where it is still, how it learns, what is left out."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,18 +12,13 @@ from tiny import make_adapter, make_model, make_trainer, make_views, parameters
 
 from d2_plugin.backbones.deform import Deform
 from d2_plugin.backbones.deform_fields import (
-    POSITION_OCTAVES,
     SPACE_PAIRS,
-    TIME_OCTAVES,
     Box,
     HexPlaneField,
     HexPlaneSettings,
-    MlpField,
-    MlpSettings,
     at_instant,
     bend,
     hats,
-    octaves,
 )
 from d2_plugin.backbones.densify import grow
 from d2_plugin.backbones.model import decayed_rate
@@ -35,33 +29,26 @@ from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.runs.run import Run
 from d2_plugin.runs.settings import RunSettings
 
-FIELDS = ("mlp", "hexplane")
 
-
-@pytest.fixture(params=FIELDS)
-def kind(request: pytest.FixtureRequest) -> str:
-    return request.param
-
-
-def deforming(kind: str) -> Deform:
+def deforming() -> Deform:
     """A model past its warm-up whose field moves things."""
-    model, generator = make_model(backbone=kind), torch.Generator().manual_seed(1)
+    model, generator = make_model(backbone="deform"), torch.Generator().manual_seed(1)
     with torch.no_grad():
         for parameter in model.field.heads.parameters():
             parameter.uniform_(-0.1, 0.1, generator=generator)
-        for plane in getattr(model.field, "time", ()):
+        for plane in model.field.time:
             plane.uniform_(0.5, 1.5, generator=generator)
     return model
 
 
 class TestModel:
-    def test_a_new_field_moves_nothing(self, kind: str) -> None:
-        model = make_model(backbone=kind)
+    def test_a_new_field_moves_nothing(self) -> None:
+        model = make_model(backbone="deform")
         assert torch.equal(model.slice_at(make_views()[0]).means, model.gaussians["positions"])
-        assert not torch.equal(deforming(kind).slice_at(make_views()[0]).means, model.gaussians["positions"])
+        assert not torch.equal(deforming().slice_at(make_views()[0]).means, model.gaussians["positions"])
 
-    def test_a_gaussian_fades_away_from_its_instant_and_goes_where_the_field_says(self, kind: str) -> None:
-        model, view, time = deforming(kind), make_views()[0], 0.2
+    def test_a_gaussian_fades_away_from_its_instant_and_goes_where_the_field_says(self) -> None:
+        model, view, time = deforming(), make_views()[0], 0.2
         with torch.no_grad():
             model.gaussians["log_time_scales"].copy_(torch.linspace(-3, 3, len(model)))
         rows = model.gaussians.parameters
@@ -81,14 +68,14 @@ class TestModel:
         torch.testing.assert_close(splats.covariances, expected.covariances[kept], rtol=1e-4, atol=1e-7)
         torch.testing.assert_close(splats.opacities, (expected.opacities * factor)[kept])
 
-    def test_gaussians_exist_at_all_instants_at_the_start(self, kind: str) -> None:
-        model = make_model(backbone=kind)
+    def test_gaussians_exist_at_all_instants_at_the_start(self) -> None:
+        model = make_model(backbone="deform")
         for time in (0.0, model.duration):
             opacities = model.slice_at(replace(make_views()[0], time=time)).opacities
             torch.testing.assert_close(opacities, torch.full((len(model),), 0.5), rtol=0.006, atol=0)
 
-    def test_what_is_inserted_where_things_move_is_gone_at_other_instants(self, kind: str) -> None:
-        model, count = deforming(kind), 2
+    def test_what_is_inserted_where_things_move_is_gone_at_other_instants(self) -> None:
+        model, count = deforming(), 2
         before = len(model)
         one = torch.full((count,), 0.1)
         lifetimes = torch.tensor([0.02, torch.inf])
@@ -97,8 +84,8 @@ class TestModel:
         assert then == [*range(before + count)]
         assert later == [*range(before), before + 1]
 
-    def test_a_split_leaves_instants_and_lifetimes_as_they_are(self, kind: str) -> None:
-        model = make_model(count=6, backbone=kind)
+    def test_a_split_leaves_instants_and_lifetimes_as_they_are(self) -> None:
+        model = make_model(count=6, backbone="deform")
         model.gaussians.statistics["screen_gradient"].fill_(1.0)
         with torch.no_grad():
             model.gaussians["log_scales"].zero_()  # large ones are split, not cloned
@@ -107,23 +94,23 @@ class TestModel:
         assert torch.equal(model.gaussians["times"], torch.cat([known, known]))
         assert len(model.gaussians["log_time_scales"].unique()) == 1
 
-    def test_noise_on_time_is_for_training_alone(self, kind: str) -> None:
-        model, view = deforming(kind), make_views()[0]
+    def test_noise_on_time_is_for_training_alone(self) -> None:
+        model, view = deforming(), make_views()[0]
         quiet = model.slice_at(view).means
         model._noise = 0.1
         assert not torch.equal(model.slice_at(view).means, quiet)
         with torch.no_grad():
             assert torch.equal(model.slice_at(view).means, quiet)
 
-    def test_noise_falls_to_zero_at_half_of_the_run(self, kind: str) -> None:
-        trainer = make_trainer(iterations=20, backbone=kind)
+    def test_noise_falls_to_zero_at_half_of_the_run(self) -> None:
+        trainer = make_trainer(iterations=20, backbone="deform")
         trainer.run(until=9)
         assert trainer.model._noise != 0
         trainer.run(until=10)
         assert trainer.model._noise == 0
 
-    def test_all_parameters_learn(self, kind: str) -> None:
-        trainer = make_trainer(iterations=30, backbone=kind)
+    def test_all_parameters_learn(self) -> None:
+        trainer = make_trainer(iterations=30, backbone="deform")
         trainer.run(until=2)
         before = parameters(trainer)
         trainer.run(until=6)
@@ -150,7 +137,6 @@ def test_d2_train_runs_and_scores_it(tmp_path: Path) -> None:
         *(str(recording), ("train0", "train1")),
         backbone="deform",
         iterations=24,
-        overrides={"backbone": {"field": "hexplane"}},
         accept_empty_prior=True,  # images this small have no stereo
     )
     run = Run(settings, tmp_path / "run")
@@ -166,14 +152,11 @@ def test_a_field_that_does_not_learn_has_the_rate_nothing() -> None:
     assert decayed_rate(0.0, 0.0, 5, 10) == 0.0
 
 
-def make_field(kind: str, seed: int = 0) -> MlpField | HexPlaneField:
+def make_field(seed: int = 0) -> HexPlaneField:
     """A field in float64 whose last layer is not zero any more."""
     generator = torch.Generator().manual_seed(seed)
     box = Box(torch.tensor([0.5, -1.0, 3.0]), torch.tensor([2.0, 1.0, 3.0]), 1.5)
-    if kind == "mlp":
-        field = MlpField(box, MlpSettings(width=12, depth=4), generator)
-    else:
-        field = HexPlaneField(box, HexPlaneSettings(features=3, resolutions=(4, 7)), generator)
+    field = HexPlaneField(box, HexPlaneSettings(features=3, resolutions=(4, 7)), generator)
     with torch.no_grad():
         for parameter in field.heads.parameters():
             parameter.uniform_(-0.5, 0.5, generator=generator)
@@ -194,20 +177,20 @@ def bilinear(plane: torch.Tensor, row: torch.Tensor, column: torch.Tensor) -> to
     return sum(corners).T
 
 
-class TestFields:
-    def test_motion_starts_from_none(self, kind: str) -> None:
-        model = make_model(backbone=kind)
+class TestField:
+    def test_motion_starts_from_none(self) -> None:
+        model = make_model(backbone="deform")
         still = model.offsets(model.gaussians["positions"], 0.3)
         assert all(not part.any() for part in still)
 
-    def test_every_parameter_but_the_positions_receives_its_gradient(self, kind: str) -> None:
-        field, positions = make_field(kind), some_positions().requires_grad_()
+    def test_every_parameter_but_the_positions_receives_its_gradient(self) -> None:
+        field, positions = make_field(), some_positions().requires_grad_()
         sum(part.square().sum() for part in field(positions, 0.37)).backward()
         assert positions.grad is None
         assert all(parameter.grad is not None and parameter.grad.any() for parameter in field.parameters())
 
-    def test_passes_gradcheck(self, kind: str) -> None:
-        field, positions = make_field(kind), some_positions(3)
+    def test_passes_gradcheck(self) -> None:
+        field, positions = make_field(), some_positions(3)
         names = [name for name, _ in field.named_parameters()]
 
         def evaluate(*values: torch.Tensor) -> tuple[torch.Tensor, ...]:
@@ -217,56 +200,21 @@ class TestFields:
             evaluate, [p.detach().requires_grad_() for p in field.parameters()], fast_mode=True
         )
 
-    def test_positions_far_outside_the_box_stay_finite(self, kind: str) -> None:
+    def test_positions_far_outside_the_box_stay_finite(self) -> None:
         far = torch.tensor([[1e6, -1e6, 1e6], [1e30, 0, 0]], dtype=torch.float64)
-        assert all(torch.isfinite(part).all() for part in make_field(kind)(far, 0.5))
+        assert all(torch.isfinite(part).all() for part in make_field()(far, 0.5))
 
-    def test_the_unit_of_length_scales_positions_alone(self, kind: str) -> None:
-        field, positions = make_field(kind), some_positions()
-        scaled = make_field(kind)
+    def test_the_unit_of_length_scales_positions_alone(self) -> None:
+        field, positions = make_field(), some_positions()
+        scaled = make_field()
         scaled.centre, scaled.reach, scaled.unit = 1e3 * field.centre, 1e3 * field.reach, 1e3 * field.unit
         for part, expected, factor in zip(scaled(1e3 * positions, 0.4), field(positions, 0.4), (1e3, 1, 1)):
             torch.testing.assert_close(part, factor * expected)
 
 
-class TestMlp:
-    def test_is_a_network_on_the_encoded_place_and_time_together(self) -> None:
-        """The official form: one row of inputs for each Gaussian, and the skip as a concatenation."""
-        field, positions, fraction = make_field("mlp"), some_positions(), 0.37
-        place = octaves((positions - field.centre) / field.reach, POSITION_OCTAVES)
-        instant = octaves(torch.tensor([2 * fraction - 1], dtype=torch.float64), TIME_OCTAVES).expand(len(place), -1)
-        inputs = torch.cat([place, instant], -1)
-        weights = [torch.cat([p.weight, t.weight], -1) for p, t in zip(field.place, field.instant)]
-        biases = [p.bias + t.bias for p, t in zip(field.place, field.instant)]
-        state = F.relu(inputs @ weights[0].T + biases[0])
-        for i, layer in enumerate(field.hidden):
-            joined = torch.cat([inputs, state], -1) if i == field.skip else state
-            weight = torch.cat([weights[1], layer.weight], -1) if i == field.skip else layer.weight
-            bias = biases[1] + layer.bias if i == field.skip else layer.bias
-            state = F.relu(joined @ weight.T + bias)
-        expected = field.heads(state)
-        torch.testing.assert_close(torch.cat(list(field(positions, fraction)), -1)[:, 3:], expected[:, 3:])
-        torch.testing.assert_close(field(positions, fraction).positions, field.unit * expected[:, :3])
-
-    def test_encoding_is_the_value_and_its_octaves(self) -> None:
-        x = torch.tensor([[0.3]], dtype=torch.float64)
-        expected = [
-            0.3,
-            *(math.sin(math.pi * k * 0.3) for k in (1, 2, 4)),
-            *(math.cos(math.pi * k * 0.3) for k in (1, 2, 4)),
-        ]
-        torch.testing.assert_close(octaves(x, 3)[0], torch.tensor(expected, dtype=torch.float64))
-
-    @pytest.mark.parametrize("depth", [1, 2, 3])
-    def test_shallow_networks_are_networks(self, depth: int) -> None:
-        box = Box(torch.zeros(3), torch.ones(3), 1.0)
-        field = MlpField(box, MlpSettings(width=8, depth=depth), torch.Generator().manual_seed(0))
-        assert field(torch.rand(5, 3), 0.5).positions.shape == (5, 3)
-
-
 class TestHexPlane:
     def test_is_the_product_of_six_bilinear_planes(self) -> None:
-        field, positions, fraction = make_field("hexplane"), some_positions(), 0.37
+        field, positions, fraction = make_field(), some_positions(), 0.37
         with torch.no_grad():
             for plane in field.time:
                 plane.uniform_(0.5, 1.5, generator=torch.Generator().manual_seed(2))
@@ -297,7 +245,7 @@ class TestHexPlane:
         assert bend(ramp, -1).item() == 0
         assert bend(ramp**2, -1).item() == 4
         assert bend(ramp, -2).item() == 0, "two nodes have no second difference"
-        field = make_field("hexplane")
+        field = make_field()
         with torch.no_grad():
             for plane in field.space:
                 plane.fill_(0.3)

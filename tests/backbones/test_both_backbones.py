@@ -191,7 +191,7 @@ def test_a_time_that_is_not_a_number_is_refused(backbone: str) -> None:
 
 class TestInsertionIntoADeformationField:
     def test_with_a_new_field_canonical_space_is_the_world(self) -> None:
-        model = make_model(backbone="hexplane")
+        model = make_model(backbone="deform")
         points = some_points(6)
         make_adapter(model).insert(points)
         assert torch.equal(model.gaussians["positions"][-6:].detach(), points.positions)

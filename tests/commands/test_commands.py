@@ -71,7 +71,7 @@ class TestHelp:
         assert "they lie further apart instead" in " ".join(table.split())
         assert f"default {DensifyConfig().budget_per_view}" in table
         assert main(["train", "--help-all", "--backbone", "deform"]) == 0
-        assert "--backbone.mlp." in capsys.readouterr().out
+        assert "--backbone.hexplane." in capsys.readouterr().out
 
     def test_bench_measures_runs_everywhere_and_other_parts_in_a_checkout(
         self, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -109,8 +109,8 @@ class TestTables:
 
     def test_the_tables_of_a_backbone_are_those_of_the_chosen_one(self, capsys: pytest.CaptureFixture[str]) -> None:
         words = ["room", *CAMERAS, "--output", "x"]
-        assert parsed("train", *words, "--backbone", "deform", "--backbone.field", "hexplane").tables == {
-            "backbone": {"field": "hexplane"}
+        assert parsed("train", *words, "--backbone", "deform", "--backbone.seed", "3").tables == {
+            "backbone": {"seed": 3}
         }
         assert main(["train", *words, "--backbone.sh-time-degre", "1"]) == 2
         assert "did you mean --backbone.sh-time-degree?" in capsys.readouterr().err

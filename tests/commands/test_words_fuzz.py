@@ -149,7 +149,7 @@ def fuzz_flags(count: int, seed: int, recording: Path, tmp_path: Path, capsys: p
             words = [name, *first.get(name, [str(recording)])]
             words += ["--train-cameras", "cam00,cam01"] if name in ("train", "plan", "priors", "ablate") else []
             words += [] if name in ("plan", "eval", "view", "compare", "doctor") else ["--output", "file/out"]
-            words += ["--backbone", "deform"] if "mlp" in flag or "hexplane" in flag else []
+            words += ["--backbone", "deform"] if "hexplane" in flag else []
             words += ["--calibration", "x"] if flag.startswith("--import") else []
             expect_an_answer([*words, f"{flag}={odd_word(rng)}"], capsys, f"flags {seed} {number}")
 

@@ -96,7 +96,7 @@ def test_a_part_in_the_middle_shows_the_same_pixels() -> None:
     torch.testing.assert_close(model.render(view).color, whole[rows, columns], atol=1e-2, rtol=0)
 
 
-@pytest.mark.parametrize("backbone", ["yang4d", "mlp"])
+@pytest.mark.parametrize("backbone", ["yang4d", "deform"])
 class TestLoss:
     def test_of_the_render_itself_at_that_time_it_is_next_to_nothing(self, backbone: str) -> None:
         adapter = make_adapter(make_model(backbone=backbone))
@@ -320,7 +320,7 @@ class TestInsertion:
         own = (model.duration / 5) ** 0.5
         torch.testing.assert_close(extents, points.lifetimes.clamp(max=own).to(extents))
 
-    @pytest.mark.parametrize("backbone", ["yang4d", "mlp"])
+    @pytest.mark.parametrize("backbone", ["yang4d", "deform"])
     @pytest.mark.parametrize("temporal", [True, False])
     def test_a_backbone_without_them_inserts_all_the_same(self, backbone: str, temporal: bool) -> None:
         model = make_model(count=4, backbone=backbone, temporal=temporal)

@@ -188,13 +188,12 @@ def test_case_31_a_huge_velocity_is_culled_and_trained(model: SplatModel) -> Non
 
 @pytest.mark.parametrize("time", [1e9, -1e9, math.inf])
 def test_case_32_a_field_rests_outside_of_the_scenes_time(time: float) -> None:
-    for backbone in ("mlp", "hexplane"):
-        model = make_model(backbone=backbone)
-        step(model, time=time)
-        end = 0.0 if time < 0 else model.duration
-        with torch.no_grad():  # else the noise of training is added to the time
-            inside, outside = (model.slice_at(replace(make_views()[0], time=t)) for t in (end, time))
-        assert all(torch.equal(a, b) for a, b in zip(inside, outside))
+    model = make_model(backbone="deform")
+    step(model, time=time)
+    end = 0.0 if time < 0 else model.duration
+    with torch.no_grad():  # else the noise of training is added to the time
+        inside, outside = (model.slice_at(replace(make_views()[0], time=t)) for t in (end, time))
+    assert all(torch.equal(a, b) for a, b in zip(inside, outside))
 
 
 def test_case_33_a_gaussian_that_no_view_sees_is_not_judged(model: SplatModel) -> None:

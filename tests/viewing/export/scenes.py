@@ -37,7 +37,7 @@ def sharp_model(backbone: str, count: int = 400, **options: object) -> SplatMode
         if model.background is not None:
             model.background.constant.normal_(0, 0.2, generator=generator)
             model.background.harmonics.normal_(0, 0.2, generator=generator)
-        if backbone == "hexplane":
+        if backbone == "deform":
             for plane in model.field.time:
                 plane += 0.3 * torch.randn(plane.shape, generator=generator)
             model.field.heads.weight.normal_(0, 0.2, generator=generator)

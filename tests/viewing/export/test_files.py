@@ -113,7 +113,7 @@ class TestThePage:
         with pytest.raises(D2Error, match="of different recordings: compare runs of one recording"):
             write_page(scenes, tmp_path / "scene.html")
 
-    @pytest.mark.parametrize("backbone", ["yang4d", "hexplane"])
+    @pytest.mark.parametrize("backbone", ["yang4d", "deform"])
     def test_a_reader_finds_the_gaussians_within_a_hundredth_of_a_pixel(self, tmp_path: Path, backbone: str) -> None:
         scene = make_scene(sharp_model(backbone))
         write_page([scene], tmp_path / "scene.html")
@@ -152,7 +152,7 @@ class TestKeys:
     def test_at_its_keys_it_is_the_model_and_between_them_as_far_off_as_it_says(
         self, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        scene = make_scene(sharp_model("hexplane"))
+        scene = make_scene(sharp_model("deform"))
         many = bake(scene)
         monkeypatch.setattr("d2_plugin.viewing.export.keys.GOOD", 1e3)
         few = bake(scene)
@@ -203,7 +203,7 @@ class TestOthersReadIt:
     def test_a_deformation_field_has_no_place_in_it(self, tmp_path: Path) -> None:
         pytest.importorskip("fourdgs", reason="fourdgs is in the `formats` extra")
         with pytest.raises(D2Error, match="this model moves by a network: choose --format html or ply"):
-            write_export([make_scene(sharp_model("hexplane"))], Export((Path(),), "4dgs"), tmp_path)
+            write_export([make_scene(sharp_model("deform"))], Export((Path(),), "4dgs"), tmp_path)
 
     @pytest.mark.parametrize("kind", ["sog", "spz"])
     def test_what_splat_transform_writes_it_reads(self, tmp_path: Path, kind: str) -> None:

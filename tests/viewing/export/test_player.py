@@ -57,7 +57,7 @@ def models() -> dict[str, tuple[SplatModel, float]]:
     """
     return {
         "4D Gaussians": (sharp_model("yang4d"), 45.0),
-        "deformation field": (sharp_model("hexplane"), 28.0),
+        "deformation field": (sharp_model("deform"), 28.0),
         "one instant": (sharp_model("yang4d", temporal=False), 45.0),
     }
 
