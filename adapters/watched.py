@@ -57,10 +57,7 @@ class WatchedModel(Resizing, Observer, Generic[Model]):
 
     def insert(self, points: Points) -> int:
         """Insert isotropic Gaussians at the points, living around the time of their frame; returns their number."""
-        rows = self.model.initial_rows(*points[:5], self.model.settings, self.model.duration)
-        if points.lifetimes is not None and "log_time_scales" in rows:
-            rows["log_time_scales"] = torch.minimum(rows["log_time_scales"], points.lifetimes.log())
-        self.model.append(rows)
+        self.model.append(self.model.initial_rows(points, self.model.settings, self.model.duration))
         return len(points.positions)
 
     def remove(self, mask: Tensor) -> None:

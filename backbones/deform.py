@@ -20,12 +20,13 @@ from d2_plugin.gaussians.moving import MovingGaussians, moving_gaussians
 from d2_plugin.gaussians.native_slice import STATIC
 from d2_plugin.gaussians.rotation4d import rotation_matrices_3d, temporal_marginal, unit_quaternions
 from d2_plugin.gaussians.slicing import LOG_SCALE_LIMIT, MARGINAL_CUT, rows_to_draw, slice_gaussians
+from d2_plugin.protocol import Points
 from d2_plugin.rasterizer import Splats, View
 from d2_plugin.settings import Seed
 
 from .deform_fields import Box, HexPlaneField, HexPlaneSettings, Offsets
 from .model import SplatModel, SplatSettings, decayed_rate
-from .starting import identity_quaternions, isotropic_rows
+from .starting import identity_quaternions, isotropic_rows, lasting_rows
 from .trainer import Trainer, TrainSettings
 
 __all__ = ["Deform", "DeformSettings", "TrainSettings", "Trainer", "create", "settings_from"]
@@ -72,21 +73,12 @@ class Deform(SplatModel):
             self.field_optimizer = torch.optim.Adam(self.field.parameter_groups(), eps=1e-15, fused=True)
 
     @staticmethod
-    def initial_rows(
-        positions: Tensor,
-        colors: Tensor,
-        times: Tensor,
-        scales: Tensor,
-        opacities: Tensor,
-        settings: DeformSettings,
-        duration: float,
-    ) -> dict[str, Tensor]:
-        """See `SplatModel.initial_rows`; they exist at all times."""
-        rows = isotropic_rows(positions, colors, scales, opacities, settings.sh_degree)
-        rows["rotations"] = identity_quaternions(len(positions), positions)
+    def initial_rows(points: Points, settings: DeformSettings, duration: float) -> dict[str, Tensor]:
+        """See `SplatModel.initial_rows`; without lifetimes they are always there, and the field says where."""
+        rows = isotropic_rows(points, settings.sh_degree)
+        rows["rotations"] = identity_quaternions(len(points.positions), points.positions)
         if settings.temporal:
-            rows["times"] = times
-            rows["log_time_scales"] = torch.full_like(scales, math.log(LASTING * max(duration, 1e-12)))
+            rows |= lasting_rows(points, LASTING * max(duration, 1e-12))
         return rows
 
     def slice_at(self, view: View) -> Splats:

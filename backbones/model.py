@@ -15,6 +15,7 @@ from torch import Tensor
 from d2_plugin.errors import D2Error
 from d2_plugin.gaussians import spherical_harmonics as sh
 from d2_plugin.gaussians.moving import Harmonics, MovingGaussians
+from d2_plugin.protocol import Points
 from d2_plugin.rasterizer import RasterSettings, Render, Splats, View, rasterize
 from d2_plugin.settings import LearningRate, Range, Settings
 
@@ -142,29 +143,16 @@ class SplatModel(ABC):
     ) -> Model:
         """A model that starts at coloured points: positions [N, 3] world, colors [N, 3] in 0..1, times [N]."""
         scales = nearest_neighbour_scales(positions).clamp(max=0.1 * extent)
-        opacities = torch.full_like(scales, INITIAL_OPACITY)
-        return cls(
-            cls.initial_rows(positions, colors, times, scales, opacities, settings, duration),
-            settings,
-            extent,
-            duration,
-        )
+        points = Points(positions, colors, times, scales, torch.full_like(scales, INITIAL_OPACITY))
+        return cls(cls.initial_rows(points, settings, duration), settings, extent, duration)
 
     def __len__(self) -> int:
         return len(self.gaussians)
 
     @staticmethod
     @abstractmethod
-    def initial_rows(
-        positions: Tensor,
-        colors: Tensor,
-        times: Tensor,
-        scales: Tensor,
-        opacities: Tensor,
-        settings: Any,
-        duration: float,
-    ) -> dict[str, Tensor]:
-        """Raw rows of isotropic Gaussians: positions [K, 3], colors [K, 3], times [K], scales [K], opacities [K]."""
+    def initial_rows(points: Points, settings: Any, duration: float) -> dict[str, Tensor]:
+        """Raw rows of isotropic Gaussians at K points, with their lifetimes where the model has such."""
 
     @abstractmethod
     def slice_at(self, view: View) -> Splats:

@@ -2,26 +2,36 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
 from d2_plugin.gaussians import spherical_harmonics as sh
+from d2_plugin.protocol import Points
 
 
-def isotropic_rows(
-    positions: Tensor, colors: Tensor, scales: Tensor, opacities: Tensor, sh_degree: int, sh_time_degree: int = 0
-) -> dict[str, Tensor]:
-    """The raw rows that every backbone has: positions [K, 3], colors [K, 3] in 0..1, scales [K], opacities [K]."""
-    coefficients = sh.coefficients_from_rgb(colors, sh_degree, sh_time_degree)
+def isotropic_rows(points: Points, sh_degree: int, sh_time_degree: int = 0) -> dict[str, Tensor]:
+    """The raw rows that every backbone has."""
+    coefficients = sh.coefficients_from_rgb(points.colors, sh_degree, sh_time_degree)
     rows = {
-        "positions": positions,
-        "log_scales": scales.log()[:, None].repeat(1, 3),
-        "opacity_logits": torch.logit(opacities, eps=1e-6),
+        "positions": points.positions,
+        "log_scales": points.scales.log()[:, None].repeat(1, 3),
+        "opacity_logits": torch.logit(points.opacities, eps=1e-6),
         "base_colors": coefficients[:, :1],
     }
     if coefficients.shape[1] > 1:
         rows["harmonics"] = coefficients[:, 1:]
     return rows
+
+
+def lasting_rows(points: Points, longest: float) -> dict[str, Tensor]:
+    """Those of Gaussians that exist around their instants, for as long as their lifetimes and no longer than that."""
+    lives = torch.full_like(points.scales, math.log(longest))
+    return {
+        "times": points.times,
+        "log_time_scales": lives if points.lifetimes is None else torch.minimum(lives, points.lifetimes.log()),
+    }
 
 
 def identity_quaternions(count: int, like: Tensor) -> Tensor:

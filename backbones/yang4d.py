@@ -11,7 +11,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated
 
-import torch
 from torch import Tensor
 
 from d2_plugin.errors import D2Error
@@ -19,11 +18,12 @@ from d2_plugin.gaussians.moving import Harmonics, MovingGaussians, moving_gaussi
 from d2_plugin.gaussians.native_slice import STATIC, TEMPORAL
 from d2_plugin.gaussians.rotation4d import rotation_matrices_3d, rotation_matrices_4d, unit_quaternions
 from d2_plugin.gaussians.slicing import slice_gaussians
+from d2_plugin.protocol import Points
 from d2_plugin.rasterizer import Splats, View
 from d2_plugin.settings import Range
 
 from .model import SplatModel, SplatSettings
-from .starting import identity_quaternions, isotropic_rows
+from .starting import identity_quaternions, isotropic_rows, lasting_rows
 from .trainer import Trainer, TrainSettings
 
 __all__ = ["TrainSettings", "Trainer", "Yang4D", "Yang4DSettings", "create", "settings_from"]
@@ -48,25 +48,17 @@ class Yang4D(SplatModel):
     settings_kind = Yang4DSettings
 
     @staticmethod
-    def initial_rows(
-        positions: Tensor,
-        colors: Tensor,
-        times: Tensor,
-        scales: Tensor,
-        opacities: Tensor,
-        settings: Yang4DSettings,
-        duration: float,
-    ) -> dict[str, Tensor]:
+    def initial_rows(points: Points, settings: Yang4DSettings, duration: float) -> dict[str, Tensor]:
         """See `SplatModel.initial_rows`.
 
         Rotations start at the identity and the temporal standard deviation at sqrt(duration / 5), as in the official
-        code (a variance of a fifth of the duration, gaussian_model.py:280).
+        code (a variance of a fifth of the duration, gaussian_model.py:280), or at the point's lifetime where that is
+        shorter.
         """
-        rows = isotropic_rows(positions, colors, scales, opacities, settings.sh_degree, _time_degree(settings))
-        rows["left"] = identity_quaternions(len(positions), positions)
+        rows = isotropic_rows(points, settings.sh_degree, _time_degree(settings))
+        rows["left"] = identity_quaternions(len(points.positions), points.positions)
         if settings.temporal:
-            rows["times"] = times
-            rows["log_time_scales"] = torch.full_like(scales, 0.5 * math.log(max(duration, 1e-12) / 5))
+            rows |= lasting_rows(points, math.sqrt(max(duration, 1e-12) / 5))
             rows["right"] = rows["left"].clone()
         return rows
 

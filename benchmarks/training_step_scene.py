@@ -17,7 +17,7 @@ from d2_plugin import registry
 from d2_plugin.config import D2Config
 from d2_plugin.hooks import DepthLossConfig
 from d2_plugin.plugin import D2Hooks
-from d2_plugin.protocol import DepthPrior, Label
+from d2_plugin.protocol import DepthPrior, Label, Points
 from d2_plugin.rasterizer import Splats, rasterize
 from d2_plugin.recordings import Camera, Recording, Source
 from d2_plugin.runs.start import TrainingFrames
@@ -106,8 +106,8 @@ class StepScene:
         moved = 0.1 * means[:, 2:] * (torch.rand(self.count, 3, generator=g) - 0.5)
         means = means + moved * (torch.arange(self.count) >= DRAWN)[:, None]
         times, scales = torch.rand(self.count, generator=g) * duration, sizes.mean(1)
-        start = backbone.Yang4D.initial_rows
-        rows: dict[str, Tensor] = start(means, colors, times, scales, opacities, settings, duration)
+        points = Points(means, colors, times, scales, opacities)
+        rows: dict[str, Tensor] = backbone.Yang4D.initial_rows(points, settings, duration)
         return rows | {"log_scales": sizes.log(), "left": quaternions, "right": quaternions.clone()}
 
     def _attach(self, model: object) -> D2Hooks:
