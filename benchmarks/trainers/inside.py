@@ -42,7 +42,7 @@ def main(words: list[str]) -> int:
         moving.watch(options.repository)
         start = time.process_time()
         runpy.run_path(command[0], run_name="__main__")
-        seconds = time.process_time() - start
+        seconds, peak_mb = time.process_time() - start, most_memory()
     except D2Error as error:
         sys.stderr.write(f"d2: {error}\n")
         return 2
@@ -57,9 +57,16 @@ def main(words: list[str]) -> int:
         psnr = SCORERS[options.repository](objects, *map(Path, held_out))
         assert sys.__stdout__ is not None  # the trainers' safe_state puts another sys.stdout into its place
         sys.__stdout__.write(f"\n[held out] iteration {objects.options.iterations}: PSNR {psnr}\n")
-    outcome["psnr_moving"] = moving.score()
+    outcome |= {"psnr_moving": moving.score(), "peak_mb": peak_mb}
     Path(outcome_file).write_text(json_text(outcome, outcome_file), encoding="utf-8")
     return 0
+
+
+def most_memory() -> int:
+    """What this process has held at most, MB: of a GPU's memory, or of the host's where there is none."""
+    on_gpu: int = torch.cuda.max_memory_allocated() >> 20
+    status = Path("/proc/self/status").read_text(encoding="utf-8")  # since exec, unlike getrusage
+    return on_gpu or int(status.partition("VmHWM:")[2].split()[0]) >> 10
 
 
 def move_seeds(by: int) -> None:

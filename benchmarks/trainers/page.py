@@ -22,6 +22,7 @@ HEADER = (
     "Gaussians",
     "D2 +/-",
     "CPU s",
+    "MB",
     "worst",
 )
 
@@ -65,7 +66,7 @@ def _line(case: tuple, rows: list[Row]) -> tuple[str, ...]:
         *(_spread(gains, sign="+"), _moving(bare, attached)),
         " → ".join(_mean(some, "gaussians") for some in (bare, attached)),
         " / ".join(_mean(attached, name) for name in ("inserted", "removed")),
-        " → ".join(_mean(some, "cpu_seconds") for some in (bare, attached)),
+        *(" → ".join(_mean(some, name) for some in (bare, attached)) for name in ("cpu_seconds", "peak_mb")),
         worst(bare, attached),
     )
 

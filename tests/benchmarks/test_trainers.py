@@ -54,7 +54,7 @@ class TestTable:
         cells = [cell.strip() for cell in line.strip("|").split("|")]
         assert cells[:3] == ["fudan", "studio", "200"]
         assert cells[3:7] == ["21.00", "the same bits", "24.00", "+3.00"]
-        assert cells[7:] == ["-", "1000 → 1500", "600 / 100", "- → -", "-0.50 at 50"]
+        assert cells[7:] == ["-", "1000 → 1500", "600 / 100", "- → -", "- → -", "-0.50 at 50"]
 
     def test_what_moves_is_compared_where_both_were_scored(self) -> None:
         bare, attached = row("bare", {"200": 21.0}, psnr_moving=18.0), row("attached", {"200": 24.0}, psnr_moving=20.5)
