@@ -18,13 +18,12 @@ def import_pycolmap(purpose: str, extra: str) -> ModuleType:
     Its import makes SIGTERM print a stack trace of C++ and abort; this takes that back, in the main thread.
 
     Raises:
-        MissingExtra: where it is not installed; the sentence names `extra`, the extra of this package that brings it.
+        MissingExtra: where it is not installed, or older; the sentence names `extra`, the extra that brings it.
     """
     first = "pycolmap" not in sys.modules
-    try:
-        import pycolmap
-    except ImportError:
-        raise missing_extra("pycolmap", extra, purpose) from None
+    pycolmap = imported("pycolmap", "pycolmap", extra, purpose)
+    if not hasattr(pycolmap, "FeatureExtractor"):
+        raise missing_extra("pycolmap 4.2 or later", extra, purpose)
     before = signal.getsignal(signal.SIGTERM)
     if first and before is not None and threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, before)

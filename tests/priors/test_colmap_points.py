@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 from dataclasses import replace
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -95,9 +96,10 @@ def test_hopeless_input_gives_no_points_and_no_abort(recording: Recording) -> No
         assert points.positions.shape == points.colors.shape == (0, 3)
 
 
-def test_a_missing_pycolmap_names_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "pycolmap", None)
-    with pytest.raises(MissingExtra, match=r"pycolmap, which is not installed: run `pip install 'd2-4dgs\[stereo\]'`"):
+@pytest.mark.parametrize(("found", "needed"), [(None, "pycolmap"), (ModuleType("pycolmap"), "pycolmap 4.2 or later")])
+def test_a_pycolmap_that_is_missing_or_old_names_its_extra(found: object, needed: str, monkeypatch) -> None:
+    monkeypatch.setitem(sys.modules, "pycolmap", found)
+    with pytest.raises(MissingExtra, match=rf"{needed}, which is not installed: run `pip install 'd2-4dgs\[stereo\]'`"):
         triangulate([], [])
 
 
