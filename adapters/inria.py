@@ -196,13 +196,14 @@ class InriaAdapter(Resizing, ABC):
 
     def _keep_evaluations(self, field: Any) -> None:
         """Keep what the trainer's field returns when it draws a view, with its graph: D2's depth of it uses that."""
-
-        def keep(_: Any, __: Any, result: tuple[Tensor, ...]) -> None:
-            if torch.is_grad_enabled() and not self._asking:
-                self._unassigned.append(result)
-
         if self._watched is None and isinstance(field, torch.nn.Module):
-            self._watched = field.register_forward_hook(keep)
+            self._watched = field.register_forward_hook(lambda _, __, result: self._keep(result))
+
+    def _keep(self, result: tuple[Any, ...]) -> tuple[Any, ...]:
+        """Keep an evaluation for the view that comes next, if the trainer made it with gradients; returns it."""
+        if torch.is_grad_enabled() and not self._asking:
+            self._unassigned.append(result)
+        return result
 
     def _evaluated(self, view: View, field: Callable[..., Any], *inputs: Any) -> Any:
         """What the trainer's own evaluation for this view returned in the present step, else ours of `field`."""

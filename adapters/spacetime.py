@@ -15,10 +15,11 @@ from pathlib import PurePosixPath
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from d2_plugin.gaussians.rotation4d import unit_quaternions
 from d2_plugin.gaussians.slicing import rows_to_draw
-from d2_plugin.protocol import Points, Splats, View
+from d2_plugin.protocol import Points, ResizeListener, Splats, View
 
 from .inria import InriaAdapter
 from .keys import KeyOf, PriorKey, frame_of_time
@@ -53,26 +54,35 @@ class SpacetimeAdapter(InriaAdapter):
         super().__init__(gaussians, key)
         self.duration, self.first_frame = duration, first_frame
 
+    def on_resize(self, listener: ResizeListener) -> None:
+        """Register a listener; D2Hooks does so only where a hook is on. What its render evaluates is kept from then on."""
+        super().on_resize(listener)
+        model = self.gaussians
+        if "get_rotation" not in self._overridden:
+            asked, self._overridden["get_rotation"] = model.get_rotation, vars(model).get("get_rotation")
+            model.get_rotation = lambda since: self._keep((asked(since), since, optional(model, "trbfoutput")))[0]
+
     def slice_at(self, view: View) -> Splats:
         """The 3D Gaussians at `view.time`; those too faint for the rasterizer to draw are left out."""
         model = self.gaussians
-        with torch.no_grad():
-            faint = self._opacities(view.time, torch.arange(len(self), device=model._xyz.device))
-            rows = rows_to_draw(faint >= self.settings.alpha_min)  # the rasterizer leaves out the faint itself
-        since = (view.time - model._trbf_center[rows]).detach()
+        rotations, since, fading = self._evaluated(view, self._at, view.time)
+        opacities = torch.sigmoid(model._opacity[:, 0]) * fading[:, 0]
+        rows = rows_to_draw(opacities.detach() >= self.settings.alpha_min)  # the rasterizer leaves out the faint itself
         first, second, third = model._motion[rows].split(3, 1)
+        since = since[rows]
         means = model._xyz[rows] + first * since + second * since**2 + third * since**3
-        rotations = unit_quaternions(model._rotation[rows] + since * model._omega[rows])
-        return splats_of(means, model._scaling[rows].exp(), rotations.T, self._opacities(view.time, rows), rows)
+        return splats_of(means, model._scaling[rows].exp(), rotations[rows], opacities[rows], rows)
 
-    def colors(self, view: View, splats: Splats) -> torch.Tensor:
+    def colors(self, view: View, splats: Splats) -> Tensor:
         """RGB [M, 3] as stored, which is the lite model's; the full model's decoder is left out."""
         return self.gaussians._features_dc[splats.rows, :3].clamp(min=0)
 
-    def _opacities(self, time: float, rows: torch.Tensor) -> torch.Tensor:
+    def _at(self, time: float) -> tuple[Tensor, ...]:
+        """Of all rows: unit quaternions, the time since their own, the share of their opacity; in its render's order."""
         model = self.gaussians
-        distance = (time - model._trbf_center[rows, 0]) / model._trbf_scale[rows, 0].exp()
-        return torch.sigmoid(model._opacity[rows, 0]) * torch.exp(-distance * distance)
+        since = time - model._trbf_center
+        rotations = unit_quaternions(model._rotation + since.detach() * model._omega).T
+        return rotations, since.detach(), torch.exp(-((since / model._trbf_scale.exp()) ** 2))
 
     def _default_key(self, camera: Any) -> PriorKey:
         """Camera by `image_name`, frame by time: one name stands for all instants."""

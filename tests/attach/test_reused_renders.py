@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 import torch
-from mimics import deformable3d, gsplat, hust4d
+from mimics import deformable3d, gsplat, hust4d, spacetime
 from mimics.inria import default_options
 from mimics.workplace import furnish
 from tiny import make_views
@@ -19,14 +19,15 @@ from d2_plugin import D2Hooks
 from d2_plugin.adapters.deformable3d import Deformable3DAdapter
 from d2_plugin.adapters.gsplat_dict import GsplatAdapter
 from d2_plugin.adapters.hust4d import Hust4DAdapter
+from d2_plugin.adapters.spacetime import SpacetimeAdapter
 from d2_plugin.config import D2Config, DepthLossConfig
 
 
 class Attached(SimpleNamespace):
-    """A mimic with the depth loss alone: its adapter, cameras, field, and how it draws one of them."""
+    """A mimic with the depth loss alone: its adapter, cameras, what they depend on in time, and how it draws one."""
 
     adapter: Any
-    field: nn.Module
+    moves: list[Tensor]
     cameras: list[Any]
     draw: Callable[[Any], object]
     d2: D2Hooks
@@ -34,7 +35,21 @@ class Attached(SimpleNamespace):
 
 
 def make(name: str) -> Attached:
-    if name == "hust4d":
+    calls: list[int] = []
+    if name == "spacetime":
+        model, scene = spacetime.make()
+        model.training_setup(default_options())
+        with torch.no_grad():
+            model._omega.fill_(0.3)
+        adapter = SpacetimeAdapter(model, 2)
+        moves = [getattr(model, f"_{part}") for part in ("rotation", "omega", "trbf_center", "trbf_scale", "motion")]
+        asked = adapter._at
+        adapter._at = lambda time: (calls.append(1), asked(time))[1]
+
+        def draw(camera: Any) -> object:
+            calls.append(1)
+            return spacetime.render(camera, model, [0, 0, 0])
+    elif name == "hust4d":
         model, scene = hust4d.make()
         model.training_setup(default_options())
         adapter, field = Hust4DAdapter(model, scene, "fine"), model._deformation
@@ -49,26 +64,27 @@ def make(name: str) -> Attached:
         def draw(camera: Any) -> object:
             return deform.step(model.get_xyz.detach(), camera.fid.expand(len(model.get_xyz), 1))
 
-    calls: list[int] = []
-    field.register_forward_hook(lambda *_: calls.append(1))
+    if name != "spacetime":
+        field.register_forward_hook(lambda *_: calls.append(1))
+        moves = list(field.parameters())
     d2 = D2Hooks(D2Config(prior="prior", depth_loss=DepthLossConfig()), adapter)
-    return Attached(adapter=adapter, field=field, cameras=scene.cameras, draw=draw, d2=d2, calls=calls, model=model)
+    return Attached(adapter=adapter, moves=moves, cameras=scene.cameras, draw=draw, d2=d2, calls=calls, model=model)
 
 
 def gradients(made: Attached, loss: Tensor) -> list[Tensor]:
-    parameters = [*made.field.parameters(), made.model._xyz, made.model._opacity]
+    parameters = [*made.moves, made.model._xyz, made.model._opacity]
     parts = torch.autograd.grad(loss, parameters, allow_unused=True)
     return [torch.zeros_like(p) if part is None else part for p, part in zip(parameters, parts, strict=True)]
 
 
-@pytest.fixture(params=["hust4d", "deformable3d"])
+@pytest.fixture(params=["hust4d", "deformable3d", "spacetime"])
 def name(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     furnish(tmp_path, monkeypatch)
     return request.param
 
 
 @pytest.mark.parametrize("batch", [1, 3])
-def test_the_field_is_evaluated_once_a_view_and_gradients_are_the_same(name: str, batch: int) -> None:
+def test_what_moves_is_evaluated_once_a_view_and_gradients_are_the_same(name: str, batch: int) -> None:
     losses = []
     for drawn in (True, False):
         made = make(name)
@@ -79,7 +95,7 @@ def test_the_field_is_evaluated_once_a_view_and_gradients_are_the_same(name: str
         assert len(made.calls) == batch
         losses.append((loss.detach(), *gradients(made, loss)))
         assert not made.adapter._unassigned
-    assert any(part.any() for part in losses[0][1:-2]), "the field has gradients"
+    assert any(part.any() for part in losses[0][1:-2]), "what moves has gradients"
     for one, other in zip(*losses, strict=True):
         torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-7)
 

@@ -38,6 +38,9 @@ class GaussianModel(InriaModel):
     def rgb(self) -> Tensor:
         return self._features_dc[:, :3] + 0 * self._features_dc[:, 3:] + 0 * self._features_t
 
+    def get_rotation(self, delta_t: Tensor) -> Tensor:
+        return nn.functional.normalize(self._rotation + delta_t * self._omega)
+
     def rates(self, opt: SimpleNamespace) -> dict[str, float]:
         further = ("trbf_center", "trbf_scale", "motion", "omega", "f_t")
         return super().rates(opt) | dict.fromkeys(further, 1e-3)
@@ -78,12 +81,12 @@ class Scene(inria.Scene):
 def render(viewpoint_camera, pc, bg_color) -> dict[str, Tensor]:
     """Median depth, as its rasterizers give it, without alpha."""
     offset = viewpoint_camera.timestamp - pc._trbf_center
-    opacity = pc.get_opacity * torch.exp(-((offset / pc._trbf_scale.exp()) ** 2))
+    pc.trbfoutput = torch.exp(-((offset / pc._trbf_scale.exp()) ** 2))
+    opacity = pc.get_opacity * pc.trbfoutput
     d = offset.detach()
     motion = pc._motion
     means = pc.get_xyz + motion[:, 0:3] * d + motion[:, 3:6] * d * d + motion[:, 6:9] * d * d * d
-    rotations = nn.functional.normalize(pc._rotation + d * pc._omega)
-    return draw_all(pc, viewpoint_camera, bg_color, means, pc.get_scaling, rotations, opacity)
+    return draw_all(pc, viewpoint_camera, bg_color, means, pc.get_scaling, pc.get_rotation(d), opacity)
 
 
 def make() -> tuple[GaussianModel, Scene]:
