@@ -233,12 +233,10 @@ class GsplatAdapter(Resizing):
 
     def _report_growth(self) -> None:
         """Without row numbers: growth means appended rows (gsplat's sample_add); D2Hooks notices shrinking."""
-        if self._count > self._known:
-            index = appended(self._known, self._count, self.parameters["means"].device)
+        if self._count != (known := self._known):
             self._renumber()
-            self._report(index)
-        elif self._count < self._known:
-            self._renumber()
+            if self._count > known:
+                self._report(appended(known, self._count, self.parameters["means"].device))
 
     def _renumber(self) -> None:
         self._known = self._count

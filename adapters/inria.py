@@ -148,14 +148,11 @@ class InriaAdapter(Resizing, ABC):
 
     def trained(self) -> dict[str, Tensor]:
         """The tensors that the trainer's optimizer changes, by the names of its groups."""
-        optimizer = optional(self.gaussians, "optimizer")
-        groups = [] if optimizer is None else optimizer.param_groups
-        named = [(group.get("name", "parameter"), group["params"]) for group in groups]
-        return {
-            name if len(values) == 1 else f"{name}.{i}": value
-            for name, values in named
-            for i, value in enumerate(values)
-        }
+        found: dict[str, Tensor] = {}
+        for group in optional(optional(self.gaussians, "optimizer"), "param_groups", ()):
+            name, values = group.get("name", "parameter"), group["params"]
+            found |= {name if len(values) == 1 else f"{name}.{i}": value for i, value in enumerate(values)}
+        return found
 
     @torch.no_grad()
     def insert(self, points: Points) -> int:

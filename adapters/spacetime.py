@@ -55,7 +55,7 @@ class SpacetimeAdapter(InriaAdapter):
         self.duration, self.first_frame = duration, first_frame
 
     def on_resize(self, listener: ResizeListener) -> None:
-        """Register a listener; D2Hooks does so only where a hook is on. What its render evaluates is kept from then on."""
+        """Register a listener; D2Hooks does so only where a hook is on. Then what its render evaluates is kept."""
         super().on_resize(listener)
         model = self.gaussians
         if "get_rotation" not in self._overridden:
@@ -78,7 +78,7 @@ class SpacetimeAdapter(InriaAdapter):
         return self.gaussians._features_dc[splats.rows, :3].clamp(min=0)
 
     def _at(self, time: float) -> tuple[Tensor, ...]:
-        """Of all rows: unit quaternions, the time since their own, the share of their opacity; in its render's order."""
+        """Of all rows: unit quaternions, the time since their own, and the share that it leaves of their opacity."""
         model = self.gaussians
         since = time - model._trbf_center
         rotations = unit_quaternions(model._rotation + since.detach() * model._omega).T

@@ -87,7 +87,10 @@ class D2Hooks:
         fitting(D2Config, config, "config of D2Hooks")
         self.config, self.backbone = config, backbone
         self.hooks: dict[str, Hook] = {name: HOOKS[name].hook(getattr(config, name)) for name in config.hooks}
-        self.hooks |= _of_other_names(hooks or {})
+        for name, hook in (hooks or {}).items():
+            if name in HOOKS:
+                raise D2Error(f"a hook of your own is named '{name}', as one of D2's ({', '.join(HOOKS)}): rename it")
+            self.hooks[name] = hook
         self.trace: deque[Trace] = deque(maxlen=1000)
         self.generator = torch.Generator().manual_seed(config.seed)
         self._sampler = ViewSampler()
@@ -363,14 +366,6 @@ class D2Hooks:
             self._warned = True
         self._count = len(self.backbone)
         self.inserted_at = torch.zeros(self._count, dtype=torch.int32)
-
-
-def _of_other_names(hooks: Mapping[str, Hook]) -> dict[str, Hook]:
-    """The hooks that were given as objects; they may not take the name of one of D2's."""
-    for name in hooks:
-        if name in HOOKS:
-            raise D2Error(f"a hook of your own is named '{name}', as one of D2's ({', '.join(HOOKS)}): rename it")
-    return dict(hooks)
 
 
 def _open_store(config: D2Config, hooks: Mapping[str, Hook]) -> Store:

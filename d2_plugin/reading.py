@@ -97,7 +97,9 @@ def read_json(path: Path | str, remedy: str = RESTORE) -> dict[str, Any]:
     """The object in a JSON file; see `parse_json`."""
     content = parse_json(read_text(path, remedy), shown_path(path), remedy)
     if not isinstance(content, dict):
-        raise Unreadable(f"{shown_path(path)} holds {_kind_of(content)}, expected a JSON object: {remedy}")
+        kinds = {list: "a list", str: "a text", bool: "true or false", type(None): "null"}
+        what = kinds.get(type(content), "a number")
+        raise Unreadable(f"{shown_path(path)} holds {what}, expected a JSON object: {remedy}")
     return content
 
 
@@ -225,11 +227,6 @@ def _check_regular(mode: int, path: Path | str, remedy: str) -> None:
         kinds = {stat.S_IFDIR: "a folder", stat.S_IFIFO: "a pipe", stat.S_IFSOCK: "a socket"}
         what = kinds.get(stat.S_IFMT(mode), "a device")
         raise Unreadable(f"{shown_path(path)} is {what}, expected a file: {remedy}")
-
-
-def _kind_of(content: Any) -> str:
-    names = {list: "a list", str: "a text", bool: "true or false", type(None): "null"}
-    return names.get(type(content), "a number")
 
 
 def _no_constant(name: str) -> NoReturn:

@@ -58,16 +58,12 @@ def _one_process(main: Callable[..., Any], settings: Any, verbose: bool = False)
 
 def _without_lpips() -> None:
     """simple_trainer.py makes its LPIPS before it trains, and that needs torchvision and a download."""
-    if importlib.util.find_spec("torchvision") is not None and not _is_stand_in("torchvision"):
+    spec = importlib.util.find_spec("torchvision")
+    if spec is not None and (spec.origin is not None or spec.submodule_search_locations):  # no stand-in
         return
     module: Any = importlib.import_module("torchmetrics.image.lpip")
     module.LearnedPerceptualImagePatchSimilarity = importlib.import_module("d2_plugin.compat.vision").NoLpips
     log.warning("torchvision is missing: LPIPS is not measured, its values are NaN")
-
-
-def _is_stand_in(package: str) -> bool:
-    spec = importlib.util.find_spec(package)
-    return spec is not None and spec.origin is None and not spec.submodule_search_locations
 
 
 class GsplatSession(Session):

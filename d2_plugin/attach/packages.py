@@ -85,11 +85,6 @@ INSTALL = {
 """What pip calls a package whose import has another name."""
 
 
-def _standard_library() -> frozenset[str]:
-    """Names of its modules; Python 3.9 does not list them, so there everything is looked for."""
-    return getattr(sys, "stdlib_module_names", frozenset())
-
-
 def needs(recipe: Recipe, path: Path) -> str:
     """One line for each package that is missing or stood in for, and one that says whether the launcher can run.
 
@@ -201,6 +196,7 @@ def needed(script: Path, conditional: bool = True) -> dict[str, str]:
     Those under an `if` depend on options; they are left out unless `conditional`.
     """
     packages: dict[str, str] = {}
+    standard = getattr(sys, "stdlib_module_names", ())  # Python 3.9 does not list them: everything is looked for there
     root, seen, waiting = script.parent, set[Path](), [script]
     while waiting:
         file = waiting.pop()
@@ -213,7 +209,7 @@ def needed(script: Path, conditional: bool = True) -> dict[str, str]:
             top = "tensorboard" if name.startswith("torch.utils.tensorboard") else name.split(".")[0]
             if inside is not None:
                 waiting.append(inside)
-            elif top not in _standard_library() and not any((base / top).is_dir() for base in roots):
+            elif top not in standard and not any((base / top).is_dir() for base in roots):
                 packages.setdefault(top, f"{file.relative_to(root)}:{line}")
     return packages
 

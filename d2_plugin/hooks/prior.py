@@ -292,7 +292,11 @@ class PriorLoader:
         self._kept.move_to_end(key)
         kept = self._kept[key]
         if kept is None:
-            self._warn_without(view)
+            if view.camera not in self._without:
+                self._without.add(view.camera)
+                have = ", ".join(map(str, getattr(self.store, "cameras", ()))) or "unknown"
+                message = "camera %s has no prior at frame %d and is trained without D2 there; the prior has cameras %s"
+                log.warning(message, view.camera, view.frame, have)
         elif key not in self._checked:
             self._check(view, kept)
             self._checked.add(key)
@@ -320,14 +324,6 @@ class PriorLoader:
                 self._dropped = True
                 message = "prior_memory_mb = %d holds the priors of %d views: the others are read from disk each time"
                 log.info(message, self.keep_bytes >> 20, len(self._kept))
-
-    def _warn_without(self, view: View) -> None:
-        if view.camera not in self._without:
-            self._without.add(view.camera)
-            log.warning(
-                "camera %s has no prior at frame %d and is trained without D2 there; the prior has cameras %s",
-                view.camera, view.frame, ", ".join(map(str, getattr(self.store, "cameras", ()))) or "unknown",
-            )  # fmt: skip
 
     def underway(self, view: View, instants: Sequence[View], quarter: int = 2) -> tuple[View, Kept] | None:
         """The view 1, 2 or 3 quarters of the way to the next of a camera's `instants`, and what is stored of it, cut to

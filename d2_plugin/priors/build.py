@@ -74,7 +74,9 @@ def build_priors(
     _refuse_without_kernels()
     frames = _shard(recording.frames, settings, shard)
     _refuse_other_images(recording, names, output)
-    names = _ordered(names, output)
+    place = PriorStore.place(output, names)
+    if (place / "store.json").is_file():  # a prior may depend on the order
+        names = list(PriorStore.described(place).cameras)
     sources = _Sources.find(recording, names, output, settings, sparse_points)
     store = PriorStore.create(output, names, recording.frames, describe_recording(recording))
     summary = PriorSummary(notes=sources.notes, folder=store.path)
@@ -273,12 +275,6 @@ def _refuse_without_kernels() -> None:
         raise D2Error(
             f"priors are built by compiled kernels, which a platform wheel brings and a checkout compiles; {error}"
         ) from None
-
-
-def _ordered(names: list[str], output: Path) -> list[str]:
-    """The cameras in the order in which their store has them already, if it does: a prior may depend on the order."""
-    place = PriorStore.place(output, names)
-    return list(PriorStore.described(place).cameras) if (place / "store.json").is_file() else names
 
 
 def _refuse_other_images(recording: Recording, names: list[str], output: Path) -> None:

@@ -13,7 +13,7 @@ from mimics import deformable3d, gsplat, hust4d, spacetime
 from mimics.inria import default_options
 from mimics.workplace import furnish
 from tiny import make_views
-from torch import Tensor, nn
+from torch import Tensor
 
 from d2_plugin import D2Hooks
 from d2_plugin.adapters.deformable3d import Deformable3DAdapter

@@ -11,7 +11,7 @@ from dataclasses import MISSING
 from d2_plugin.commands.arguments.form import HELP, Form, Section, is_switch, typed_as
 from d2_plugin.commands.arguments.text import flag_of, item_kind, limits, placeholder, written
 from d2_plugin.errors import unknown_name
-from d2_plugin.settings import Declared, Range
+from d2_plugin.settings import Declared
 
 COLUMN = 30
 """Where the explanations begin."""
@@ -73,14 +73,11 @@ def _typed(setting: Declared) -> str:
 
 def _explained(setting: Declared) -> str:
     """The docstring, then range, unit and default."""
-    facts = [_bounds(limits(setting)), "needed" if setting.default is MISSING else _default(setting)]
+    where = limits(setting)
+    bounds = ", ".join(part for part in (where.unit, where.described()) if part not in ("", "finite"))
+    facts = [bounds, "needed" if setting.default is MISSING else _default(setting)]
     facts_text = "; ".join(fact for fact in facts if fact)
     return f"{setting.help} ({facts_text})".strip() if facts_text else setting.help
-
-
-def _bounds(where: Range) -> str:
-    bounds = where.described()
-    return ", ".join(part for part in (where.unit, bounds) if part not in ("", "finite"))
 
 
 def _default(setting: Declared) -> str:

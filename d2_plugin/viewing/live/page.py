@@ -147,9 +147,10 @@ class Page:
     def number(self, name: str, default: float) -> float:
         """The number of a slider, within its ends; the default where there is no such slider or no number."""
         slider = self.controls.get(name)
-        if slider is None or not _is_number(slider.value):
+        value = getattr(slider, "value", None)
+        if slider is None or isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
             return default
-        return float(min(max(slider.value, slider.min), slider.max))
+        return float(min(max(value, slider.min), slider.max))
 
     def word(self, name: str, default: str) -> str:
         """The word of a menu; the default where there is no such menu, or another word was sent."""
@@ -293,7 +294,3 @@ def _seen_through(camera: Any) -> tuple[tuple[float, ...], float] | None:
     fits = len(pose) == 8 and all(abs(number) <= LARGEST_NUMBER for number in pose)  # NaN is not
     fits = fits and 1 / WIDEST <= aspect <= WIDEST and abs(math.hypot(*pose[3:7]) - 1) < 0.1
     return (pose, aspect) if fits and FIELD_OF_VIEW[0] <= math.degrees(pose[7]) <= FIELD_OF_VIEW[1] else None
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
