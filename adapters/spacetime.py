@@ -53,6 +53,7 @@ class SpacetimeAdapter(InriaAdapter):
     ) -> None:
         super().__init__(gaussians, key)
         self.duration, self.first_frame = duration, first_frame
+        self._fading: Tensor | None = None
 
     def on_resize(self, listener: ResizeListener) -> None:
         """Register a listener; D2Hooks does so only where a hook is on. Then what its render evaluates is kept."""
@@ -60,7 +61,15 @@ class SpacetimeAdapter(InriaAdapter):
         model = self.gaussians
         if "get_rotation" not in self._overridden:
             asked, self._overridden["get_rotation"] = model.get_rotation, vars(model).get("get_rotation")
-            model.get_rotation = lambda since: self._keep((asked(since), since, optional(model, "trbfoutput")))[0]
+            model.get_rotation = lambda since: self._rotated(asked(since), since)
+
+    def _rotated(self, rotations: Tensor, since: Tensor) -> Tensor:
+        """Keep what its render has just evaluated; a render that leaves no new `trbfoutput` is not used."""
+        fading = optional(self.gaussians, "trbfoutput")
+        if fading is not None and fading is not self._fading:
+            self._fading = fading
+            self._keep((rotations, since, fading))
+        return rotations
 
     def slice_at(self, view: View) -> Splats:
         """The 3D Gaussians at `view.time`; those too faint for the rasterizer to draw are left out."""

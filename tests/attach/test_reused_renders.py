@@ -120,6 +120,19 @@ def test_what_cannot_be_assigned_is_evaluated_anew(name: str) -> None:
     assert len(made.calls) == 1
 
 
+def test_a_render_that_leaves_no_new_fading_is_not_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Some renders of SpacetimeGaussians evaluate rotations and leave `trbfoutput` as an earlier view has it."""
+    furnish(tmp_path, monkeypatch)
+    made = make("spacetime")
+    made.draw(made.cameras[0])
+    assert len(made.adapter._unassigned) == 1
+    model = made.model
+    model.get_rotation(0.3 - model._trbf_center.detach())
+    model.trbfoutput = None
+    model.get_rotation(0.4 - model._trbf_center.detach())
+    assert len(made.adapter._unassigned) == 1
+
+
 def test_without_a_hook_nothing_is_kept(name: str) -> None:
     made = make(name)
     made.adapter.detach()
