@@ -36,6 +36,7 @@ from .shared import (
     on_device,
     optional,
     seen_colors,
+    steps_of_adam,
 )
 
 log = logging.getLogger(__name__)
@@ -133,6 +134,10 @@ class InriaAdapter(Resizing, ABC):
             self._renders.forget()
             self._evaluations.forget()
         self._step = step
+
+    def pace(self, step: int) -> float:
+        """As how many of Adam's steps the optimizer's first `step` count."""
+        return steps_of_adam(optional(self.gaussians, "optimizer"), step)
 
     @abstractmethod
     def slice_at(self, view: View) -> Splats:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable
 from dataclasses import replace
+from functools import lru_cache
 from typing import Any, Generic, TypeVar
 from weakref import WeakKeyDictionary
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -14,6 +16,9 @@ from d2_plugin.gaussians.rotation4d import covariances_from_factors, rotation_ma
 from d2_plugin.gaussians.spherical_harmonics import SH_C0, channel_count
 from d2_plugin.gaussians.spherical_harmonics import colors as harmonic_colors
 from d2_plugin.protocol import Points, ResizeListener, Splats, View
+
+ADAPTS = 5.0
+"""Length of the approximated moving average above which RAdam adapts its steps."""
 
 Render = TypeVar("Render")
 Answer = TypeVar("Answer")
@@ -76,6 +81,35 @@ def optional(owner: Any, name: str, default: Any = None) -> Any:
     """An attribute that some versions of a repository lack or leave at None; `default` there."""
     value = getattr(owner, name, None)
     return default if value is None else value
+
+
+def steps_of_adam(optimizer: object, step: int) -> float:
+    """As how many of Adam's steps the first `step` of an optimizer count: as many, but for RAdam.
+
+    Its steps are a share of Adam's that grows from 0 over some 2 / (1 - beta2): with .999 .05 at 10, .52 at 600.
+    Source: Liu et al., On the variance of the adaptive learning rate and beyond (ICLR 2020), as torch.optim has it.
+    """
+    if not isinstance(optimizer, torch.optim.RAdam):
+        return step
+    step = max(step, 0)
+    return float(_sums_of_shares(optimizer.param_groups[0]["betas"][1], 1 << step.bit_length())[step])
+
+
+@lru_cache
+def _sums_of_shares(beta: float, steps: int) -> np.ndarray:
+    """Entry t is the sum of the first t shares, float64 [steps].
+
+    With a beta up to .6 RAdam never adapts its steps to the gradients: they are as large at first as later.
+    """
+    t = np.arange(1, steps)
+    longest = 2 / (1 - beta) - 1
+    if longest <= ADAPTS:
+        return np.arange(steps, dtype=np.float64)
+    power = beta**t
+    length = longest - 2 * t * power / (1 - power)
+    adapts, length = length > ADAPTS, np.fmax(length, ADAPTS)
+    share = np.sqrt((length - 4) * (length - 2) * longest / ((longest - 4) * (longest - 2) * length))
+    return np.concatenate([[0.0], np.cumsum(share * adapts)])
 
 
 def on_device(view: View, like: Tensor) -> View:

@@ -7,7 +7,7 @@ own choices, set by measurement.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, make_dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Optional, cast
@@ -24,6 +24,9 @@ from d2_plugin.settings import FORMAT, NONE, AtLeastOne, Count, Range, Seed, Set
 from d2_plugin.values import checked_arguments
 
 __all__ = ["D2Config", "DensifyConfig", "DepthLossConfig", "MotionConfig", "PruneConfig", "for_iterations"]
+
+Pace = Callable[[int], int]
+"""The step of schedules at a step of the trainer."""
 
 if TYPE_CHECKING:
     _HookTables: Any = Settings
@@ -72,23 +75,27 @@ class D2Config(_HookTables):
     """Seed of D2's own random generator."""
 
     @classmethod
-    def from_dict(cls, table: Mapping[str, Any], where: str = "") -> D2Config:
-        """From nested mappings, as in TOML; an unknown name, a wrong type or value is refused with one sentence."""
+    def from_dict(cls, table: Mapping[str, Any], where: str = "", pace: Pace = int) -> D2Config:
+        """From nested mappings, as in TOML; an unknown name, a wrong type or value is refused with one sentence.
+
+        `pace` gives the step of schedules from that of the trainer (`d2_plugin.protocol.schedule_step`).
+        """
         plain = of_this_format(table, where or "the configuration")
         for name, value in plain.items():
             if isinstance(value, Mapping) and name not in HOOKS:
                 raise unknown_name("hook", name, HOOKS)
         length = plain.get("iterations")
         if isinstance(length, int) and not isinstance(length, bool) and length > 0:
-            plain |= {name: _scheduled(name, plain[name], length) for name in HOOKS if name in plain}
+            paced = max(1, pace(length))
+            plain |= {name: _scheduled(name, plain[name], paced) for name in HOOKS if name in plain}
         return super().from_dict(plain, where)
 
     @classmethod
     @checked_arguments
-    def from_toml(cls, path: str | Path, iterations: int | None = None) -> D2Config:
+    def from_toml(cls, path: str | Path, iterations: int | None = None, pace: Pace = int) -> D2Config:
         """From a TOML file: `prior = "..."` and one table per hook, empty for its defaults.
 
-        `iterations` is the length of the run where the file does not say one.
+        `iterations` is the length of the run where the file does not say one; `pace` as in `from_dict`.
         """
         path = Path(path)
         try:
@@ -96,7 +103,7 @@ class D2Config(_HookTables):
         except NoSuchFile:
             raise D2Error(f"no configuration at {path}: write one, or pass the settings as a dict") from None
         length = {} if iterations is None else {"iterations": iterations}
-        config = cls.from_dict(length | of_this_format(table, str(path)))
+        config = cls.from_dict(length | of_this_format(table, str(path)), pace=pace)
         below = {name: str(path.parent / value) for name in ("prior", "exported") if (value := getattr(config, name))}
         return replace(config, **cast("dict[str, Any]", below))
 

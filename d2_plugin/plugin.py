@@ -39,7 +39,7 @@ from d2_plugin.hooks.finite import FiniteCheck
 from d2_plugin.hooks.prior import Store
 from d2_plugin.hooks.reports import OnReport, Report, RunLog, ScalarWriter, Trace
 from d2_plugin.hooks.views import ViewSampler
-from d2_plugin.protocol import Backbone, Edit, Points, View, call_optional
+from d2_plugin.protocol import Backbone, Edit, Points, View, call_optional, schedule_step
 from d2_plugin.reading import said
 from d2_plugin.registry import ADAPTERS, load
 from d2_plugin.values import checked_arguments, fitting
@@ -135,14 +135,17 @@ class D2Hooks:
             backbone: an adapter, or a class of your own, see `d2_plugin.protocol.Backbone`.
             store: anything with `prior(camera, frame) -> DepthPrior | None`; by default the folder `config.prior`.
             hooks: more of them by name, as objects: your own, or what D2 is compared with.
-            iterations: length of the run in steps; schedules that the configuration leaves out follow from it.
+            iterations: length of the run in steps; schedules that the configuration leaves out follow from it, and from
+                the backbone's `pace` where it has one.
             on_report: called with the `Report` of every step.
             writer: anything with `add_scalar(tag, value, step)`, a TensorBoard SummaryWriter for instance.
         """
+        pace = functools.partial(schedule_step, backbone)
         if isinstance(config, (str, Path)):
-            config = D2Config.from_toml(config, iterations)
+            config = D2Config.from_toml(config, iterations, pace)
         elif not isinstance(config, D2Config):
-            config = D2Config.from_dict(config if iterations is None else {"iterations": iterations, **config})
+            table = config if iterations is None else {"iterations": iterations, **config}
+            config = D2Config.from_dict(table, pace=pace)
         d2 = cls(config, backbone, store, hooks)
         d2.log.start(backbone, d2.prior, config.iterations or iterations, on_report, writer)
         return d2
@@ -282,7 +285,10 @@ class D2Hooks:
         if not call_optional(self.backbone, "active", step, default=True):
             return []  # in its other stages a trainer may count anew
         self._order.check(step, ends)
-        return [(name, hook) for name, hook in self.hooks.items() if name not in self.retired and hook.window.due(step)]
+        now = schedule_step(self.backbone, step)
+        if ends and now == schedule_step(self.backbone, step - 1):
+            return []  # it was due at an earlier step of this pace
+        return [(name, hook) for name, hook in self.hooks.items() if name not in self.retired and hook.window.due(now)]
 
     def _context(self, step: int, views: Sequence) -> Context:
         def sample() -> Sequence:
@@ -293,7 +299,8 @@ class D2Hooks:
         assert self.prior is not None, "a step without hooks has no context"
         instants, motion = self._sampler.instants, self.config.motion
         halfway = motion is not None and motion.insert
-        return Context(step, self.backbone, views, self.prior, self.generator, sample, instants, halfway)
+        now = schedule_step(self.backbone, step)
+        return Context(now, self.backbone, views, self.prior, self.generator, sample, instants, halfway)
 
     def _retire_if_idle(self, step: int, name: str, edit: Edit | None, context: Context) -> None:
         if name not in HOOKS or not HOOKS[name].edits_structure or not context.evaluation:

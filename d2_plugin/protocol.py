@@ -231,6 +231,9 @@ class Backbone(Protocol):
         RGB [3, H, W] in 0..1 of a trainer's camera: asked for once per view, and held against the prior's colours.
     ``active(step) -> bool``
         False while the hooks must wait (stages, warm-up); changes nothing.
+    ``pace(step) -> float``
+        as how many of Adam's steps the optimizer's first `step` count, where it takes smaller ones for a while, as
+        RAdam does: schedules count these. It rises by one a step at most.
     ``colors(view, splats) -> Tensor``
         RGB [M, 3], 0 or more, of what `slice_at(view)` returned, differentiable: the live viewer shows them, and grey
         without; the hook `motion` supervises them.
@@ -266,3 +269,8 @@ def call_optional(backbone: object, name: str, *arguments: Any, default: Any = N
     """What an optional member of a backbone returns (see `Backbone`), or `default` where the backbone has none."""
     method = getattr(backbone, name, None)
     return default if method is None else method(*arguments)
+
+
+def schedule_step(backbone: object, step: int) -> int:
+    """The step of the hooks' schedules at a step of the trainer, see `pace` of `Backbone`; the same without one."""
+    return int(call_optional(backbone, "pace", step, default=step))

@@ -6,7 +6,7 @@ import importlib
 import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import wraps
+from functools import partial, wraps
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +14,12 @@ import torch
 from torch import Tensor
 
 from d2_plugin import registry
-from d2_plugin.config import D2Config
+from d2_plugin.config import D2Config, Pace
 from d2_plugin.errors import D2Error
 from d2_plugin.hooks.prior import Store
 from d2_plugin.hooks.reports import RunLog
 from d2_plugin.plugin import D2Hooks
-from d2_plugin.protocol import Backbone
+from d2_plugin.protocol import Backbone, schedule_step
 
 log = logging.getLogger(__name__)
 
@@ -186,13 +186,14 @@ class Session:
 
     def attach(self, iterations: int | None) -> None:
         """Make the adapter and the hooks of the objects seen, for a run of that many iterations."""
-        backbone, config = self.recipe.backbone(self.objects), self._configured(iterations)
+        backbone = self.recipe.backbone(self.objects)
+        config = self._configured(iterations, partial(schedule_step, backbone))
         self.hooks = D2Hooks.from_config(config, backbone, self.store, iterations=iterations)
         self._iteration, self._counted, self._drawn, self._batch = 0, False, 0, 0
 
-    def _configured(self, iterations: int | None) -> D2Config:
+    def _configured(self, iterations: int | None, pace: Pace) -> D2Config:
         assert self.config is not None
-        config = self.config if isinstance(self.config, D2Config) else D2Config.from_toml(self.config, iterations)
+        config = self.config if isinstance(self.config, D2Config) else D2Config.from_toml(self.config, iterations, pace)
         exported = self.exported or self._export_read(config)
         return config if exported is None else replace(config, exported=str(exported))
 

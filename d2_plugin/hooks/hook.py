@@ -77,6 +77,7 @@ class Context:
     """Everything a hook may look at in one step; `evaluation` is computed once and shared by all hooks."""
 
     step: int
+    """Of the schedules, see `d2_plugin.protocol.schedule_step`."""
     backbone: Backbone
     views: Sequence[View]
     """The views of the present training step."""

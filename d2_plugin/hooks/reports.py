@@ -16,7 +16,7 @@ from torch import Tensor
 from d2_plugin.hooks import HOOKS
 from d2_plugin.hooks.hook import Hook
 from d2_plugin.hooks.prior import PriorLoader
-from d2_plugin.protocol import Backbone
+from d2_plugin.protocol import Backbone, schedule_step
 
 log = logging.getLogger(__name__)
 
@@ -102,7 +102,10 @@ class RunLog:
         if iterations is None:
             self._warn_of_default_schedules()
         else:
-            self._warn_of_short_schedules(iterations)
+            paced = schedule_step(backbone, iterations)
+            if paced != iterations:
+                log.info("schedules count as the optimizer does: %d steps are worth %d of Adam's", iterations, paced)
+            self._warn_of_short_schedules(paced)
         _at_exit(self)
 
     def record_loss(self, name: str, term: Tensor) -> None:
