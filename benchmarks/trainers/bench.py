@@ -34,14 +34,16 @@ class TrainersBench(Settings):
     """Recordings with cameras 00 to 07, of which 00 02 05 07 are trained on."""
     only: tuple[str, ...] = ()
     """Repositories as the launcher names them; all if left out."""
-    methods: tuple[str, ...] = METHODS
-    """Which runs of each: bare, no hooks, attached."""
+    methods: tuple[str, ...] = METHODS[:3]
+    """Which runs of each: bare, no hooks, attached, with motion."""
     iterations: Annotated[int, Range(10, unit="iterations")] = 300
     """Length of each run."""
     seeds: tuple[Seed, ...] = (0,)
     """Added to every seed that a script sets; 0 is the script as it is. A claim needs three."""
     frames: Annotated[int, Range(2)] = 9
-    """Frames of each recording, from the first."""
+    """Frames of each recording that are trained on, from the first."""
+    hold_out_instants: Annotated[int, Range(0, unit="instants")] = 0
+    """Train every so-manieth instant alone and score what moves at those between as well; 0 or 1 trains all."""
     downscale: Annotated[int, Range(1)] = 2
     """Make images this many times smaller along each side."""
     work: Path = Path("trainers")
@@ -77,11 +79,15 @@ def rows_of(name: str, settings: TrainersBench) -> Iterator[Row]:
     """One repository: a row for each recording, seed and method, as soon as it is there."""
     assert settings.checkouts is not None
     trial = TRIALS[name]
+    if settings.hold_out_instants > 1 and trial.clock is None:
+        able = ", ".join(name for name, known in TRIALS.items() if known.clock is not None)
+        raise D2Error(f"{name} is not scored between instants: give --only {able}, or train all instants")
     if not settings.recordings:
         raise D2Error("no recording to train on: give --recordings, each with cameras 00 to 07")
     command = command_line("python -m benchmarks trainers", settings)
     for recording in settings.recordings:
-        prepared = prepare(Source(recording.resolve(), settings.frames, settings.downscale), trial, settings.work)
+        source = Source(recording.resolve(), settings.frames, settings.downscale, max(settings.hold_out_instants, 1))
+        prepared = prepare(source, trial, settings.work)
         for seed in settings.seeds:
             for method in settings.methods:
                 folder = settings.work / "runs" / f"{name}-{recording.name}-{method.replace(' ', '-')}-{seed}"

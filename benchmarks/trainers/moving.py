@@ -39,7 +39,10 @@ def save_truth(recording: Path, frames: Sequence[int], downscale: int, output: P
             images.append(whole.image(camera, whole.frames[frame]))
             moving.append(np.abs(images[-1].astype(np.float32) / 255 - still).max(-1) > CHANGED)
             held_out.append(camera in HELD_OUT)
-    np.savez(output, images=np.stack(images), moving=np.stack(moving), held_out=np.array(held_out))
+    np.savez(
+        output, images=np.stack(images), moving=np.stack(moving), held_out=np.array(held_out),
+        recording=str(recording.resolve()), frames=np.array(frames), downscale=downscale,
+    )  # fmt: skip
     return output
 
 

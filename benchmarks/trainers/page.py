@@ -33,19 +33,19 @@ def read_rows(path: Path) -> list[Row]:
         return []
     lines = read_text(path, "run `python -m benchmarks trainers`").splitlines()
     rows = [parse_json(line, f"{path}, line {i}", "run it again") for i, line in enumerate(lines, start=1) if line]
-    latest = {tuple(row[name] for name in _SAME): row for row in rows}
+    latest = {tuple(row.get(name) for name in _SAME): row for row in rows}
     return list(latest.values())
 
 
-_SAME = ("repository", "recording", "frames", "downscale", "iterations", "seed", "method")
-_CASE = ("repository", "recording", "frames", "downscale", "iterations")
+_CASE = ("repository", "recording", "frames", "downscale", "iterations", "hold_out_instants")
+_SAME = (*_CASE, "seed", "method")
 
 
 def table(rows: Sequence[Row]) -> str:
     """Markdown: one line for each repository and recording, means over the seeds, and what did not run below."""
     cases: dict[tuple, list[Row]] = {}
     for row in rows:
-        cases.setdefault(tuple(row[name] for name in _CASE), []).append(row)
+        cases.setdefault(tuple(row.get(name) for name in _CASE), []).append(row)
     lines = tuple(_line(case, found) for case, found in cases.items() if any(row["psnr"] for row in found))
     failed = [
         f"- {row['repository']} on {row['recording']}, {row['method']}: {row['failed']}"

@@ -23,19 +23,26 @@ class Source:
 
     recording: Path
     frames: int
-    """From the first."""
+    """How many, from the first."""
     downscale: int
+    step: int = 1
+    """From one of them to the next."""
 
     @property
     def name(self) -> str:
         """For folders of the working folder."""
-        return f"{self.recording.name}-{self.frames}-{self.downscale}"
+        return f"{self.recording.name}-{self.frames}-{self.downscale}" + (f"-{self.step}" if self.step > 1 else "")
 
     @property
     def seconds(self) -> float:
         """Length of the clip: one frame more than its last begins."""
         opened = open_recording(self.recording)
-        return self.frames / opened.fps
+        return self.frames * self.step / opened.fps
+
+    @property
+    def numbers(self) -> range:
+        """Of the frames."""
+        return range(0, self.frames * self.step, self.step)
 
 
 @dataclass(frozen=True)
@@ -59,9 +66,9 @@ def prepare(source: Source, trial: Trial, work: Path) -> Prepared:
     held_out = None
     if trial.also_held_out:
         held_out = _exported(source, trial, work / "exports" / f"{named}-held-out", HELD_OUT, ())
-    truth = work / f"{source.name}.npz"
+    truth = work / f"truth-{source.name}.npz"
     if not truth.is_file():
-        save_truth(source.recording, range(source.frames), source.downscale, truth)
+        save_truth(source.recording, source.numbers, source.downscale, truth)
     return Prepared(source, data, held_out, _prior(source, work / "priors" / source.name), truth.resolve())
 
 
@@ -85,7 +92,7 @@ def _exported(source: Source, trial: Trial, output: Path, trained: tuple[str, ..
     if not output.is_dir():
         asked = RecordingExport(
             *(source.recording, trial.layout, output, trained, held_out),  # type: ignore[arg-type]  # a known layout
-            frames=tuple(range(source.frames)),
+            frames=tuple(source.numbers),
             downscale=source.downscale,
             points=trial.points,
         )
@@ -102,7 +109,7 @@ def _prior(source: Source, output: Path) -> Path:
     if (output / "store.json").is_file():
         return output.resolve()
     words = ["priors", str(source.recording), "--train-cameras", ",".join(TRAINED), "--output", str(output)]
-    words += ["--frames", f"0:{source.frames - 1}", "--downscale", str(source.downscale)]
+    words += ["--frames", f"0:{source.numbers[-1]}:{source.step}", "--downscale", str(source.downscale)]
     done = subprocess.run([str(Path(sys.executable).with_name("d2")), *words], check=False)
     if done.returncode != 0:
         raise D2Error(f"`d2 {' '.join(words)}` ended with code {done.returncode}: its output above says why")

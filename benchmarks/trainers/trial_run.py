@@ -13,11 +13,12 @@ from d2_plugin.reading import parse_json, read_text
 
 Row = dict[str, Any]
 
-BARE, NO_HOOKS, ATTACHED = METHODS = ("bare", "no hooks", "attached")
+BARE, NO_HOOKS, ATTACHED, WITH_MOTION = METHODS = ("bare", "no hooks", "attached", "with motion")
 
 CONFIGURATIONS = {
     NO_HOOKS: 'prior = "{prior}"\n',
     ATTACHED: 'prior = "{prior}"\n[densify]\n[prune]\n[depth_loss]\n',
+    WITH_MOTION: 'prior = "{prior}"\n[densify]\n[prune]\n[depth_loss]\n[motion]\n',
 }
 """d2.toml of each method: the defaults, with schedules that follow from the length that the trainer announces."""
 
@@ -32,6 +33,7 @@ def trial_row(
     source = prepared.source
     row: Row = {"repository": name, "source": trial.source, "checkout": commit_of(checkout)}
     row |= {"recording": source.recording.name, "frames": source.frames, "downscale": source.downscale}
+    row |= {"hold_out_instants": source.step} if source.step > 1 else {}
     row |= {"method": method, "iterations": iterations, "seed": seed}
     row |= {"scored_on": trial.scored_on, "psnr": {}, "failed": None}
     shutil.rmtree(folder, ignore_errors=True)

@@ -9,7 +9,7 @@ import socket
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from d2_plugin.reading import json_text
 
@@ -102,6 +102,9 @@ class Trial:
     """Least number of initial points."""
     least_side: int = 1
     """Pixels that the shorter side of an image must have."""
+    clock: Literal["seconds", "share"] | None = None
+    """Its unit of time, since the first frame: seconds, or the share of the clip. None: instants between those that it
+    trains on cannot be asked for."""
     also_held_out: bool = False
     """Whether the held-out cameras are exported a second time, as if they were trained on, to be scored on."""
 
@@ -209,6 +212,7 @@ def _gsplat(job: Job) -> list[str]:
 TRIALS = {
     "fudan": Trial(
         *("fudan-zvg/4d-gaussian-splatting", "transforms", HELD_OUT, _fudan),
+        clock="seconds",
         least_side=161,  # its report measures MS-SSIM, whose fifth scale needs ten pixels and one more
     ),
     "4c4d": Trial("yangzf-1023/4C4D", "transforms", HELD_OUT, _4c4d),
@@ -218,11 +222,13 @@ TRIALS = {
     "hust4d": Trial(
         *("hustvl/4DGaussians", "multipleview", (), _hust4d, scored_after),
         scored_on="all held-out cameras, read and drawn by its own code after `train.py`",
+        clock="share",
         also_held_out=True,
     ),
     "spacetime": Trial(
         *("oppo-us-research/SpacetimeGaussians", "colmap_frames", HELD_OUT[:1], _spacetime, scored_after),
         scored_on="the first held-out camera, drawn by its own code after `train.py`",
+        clock="share",
         points=300,
     ),
     "ex4dgs": Trial(
