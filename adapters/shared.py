@@ -17,9 +17,6 @@ from d2_plugin.gaussians.spherical_harmonics import SH_C0, channel_count
 from d2_plugin.gaussians.spherical_harmonics import colors as harmonic_colors
 from d2_plugin.protocol import Points, ResizeListener, Splats, View
 
-ADAPTS = 5.0
-"""Length of the approximated moving average above which RAdam adapts its steps."""
-
 Render = TypeVar("Render")
 Answer = TypeVar("Answer")
 
@@ -102,14 +99,12 @@ def _sums_of_shares(beta: float, steps: int) -> np.ndarray:
     With a beta up to .6 RAdam never adapts its steps to the gradients: they are as large at first as later.
     """
     t = np.arange(1, steps)
-    longest = 2 / (1 - beta) - 1
-    if longest <= ADAPTS:
+    longest, power = 2 / (1 - beta) - 1, beta**t
+    if longest <= 5:
         return np.arange(steps, dtype=np.float64)
-    power = beta**t
-    length = longest - 2 * t * power / (1 - power)
-    adapts, length = length > ADAPTS, np.fmax(length, ADAPTS)
+    length = np.fmax(longest - 2 * t * power / (1 - power), 5)  # of the moving average; at 5 and below nothing adapts
     share = np.sqrt((length - 4) * (length - 2) * longest / ((longest - 4) * (longest - 2) * length))
-    return np.concatenate([[0.0], np.cumsum(share * adapts)])
+    return np.concatenate([[0.0], np.cumsum(share * (length > 5))])
 
 
 def on_device(view: View, like: Tensor) -> View:

@@ -25,9 +25,6 @@ from d2_plugin.values import checked_arguments
 
 __all__ = ["D2Config", "DensifyConfig", "DepthLossConfig", "MotionConfig", "PruneConfig", "for_iterations"]
 
-Pace = Callable[[int], int]
-"""The step of schedules at a step of the trainer."""
-
 if TYPE_CHECKING:
     _HookTables: Any = Settings
 else:  # one field per row of the table of hooks
@@ -75,7 +72,7 @@ class D2Config(_HookTables):
     """Seed of D2's own random generator."""
 
     @classmethod
-    def from_dict(cls, table: Mapping[str, Any], where: str = "", pace: Pace = int) -> D2Config:
+    def from_dict(cls, table: Mapping[str, Any], where: str = "", pace: Callable[[int], int] = int) -> D2Config:
         """From nested mappings, as in TOML; an unknown name, a wrong type or value is refused with one sentence.
 
         `pace` gives the step of schedules from that of the trainer (`d2_plugin.protocol.schedule_step`).
@@ -92,7 +89,7 @@ class D2Config(_HookTables):
 
     @classmethod
     @checked_arguments
-    def from_toml(cls, path: str | Path, iterations: int | None = None, pace: Pace = int) -> D2Config:
+    def from_toml(cls, path: str | Path, iterations: int | None = None, pace: Callable[[int], int] = int) -> D2Config:
         """From a TOML file: `prior = "..."` and one table per hook, empty for its defaults.
 
         `iterations` is the length of the run where the file does not say one; `pace` as in `from_dict`.

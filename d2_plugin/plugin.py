@@ -135,8 +135,7 @@ class D2Hooks:
             backbone: an adapter, or a class of your own, see `d2_plugin.protocol.Backbone`.
             store: anything with `prior(camera, frame) -> DepthPrior | None`; by default the folder `config.prior`.
             hooks: more of them by name, as objects: your own, or what D2 is compared with.
-            iterations: length of the run in steps; schedules that the configuration leaves out follow from it, and from
-                the backbone's `pace` where it has one.
+            iterations: length of the run in steps; schedules that the configuration leaves out follow from it (`pace`).
             on_report: called with the `Report` of every step.
             writer: anything with `add_scalar(tag, value, step)`, a TensorBoard SummaryWriter for instance.
         """

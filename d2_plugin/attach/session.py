@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from d2_plugin import registry
-from d2_plugin.config import D2Config, Pace
+from d2_plugin.config import D2Config
 from d2_plugin.errors import D2Error
 from d2_plugin.hooks.prior import Store
 from d2_plugin.hooks.reports import RunLog
@@ -191,7 +191,7 @@ class Session:
         self.hooks = D2Hooks.from_config(config, backbone, self.store, iterations=iterations)
         self._iteration, self._counted, self._drawn, self._batch = 0, False, 0, 0
 
-    def _configured(self, iterations: int | None, pace: Pace) -> D2Config:
+    def _configured(self, iterations: int | None, pace: Callable[[int], int]) -> D2Config:
         assert self.config is not None
         config = self.config if isinstance(self.config, D2Config) else D2Config.from_toml(self.config, iterations, pace)
         exported = self.exported or self._export_read(config)

@@ -1,8 +1,7 @@
 """The kernels on the GPU: `kernels/gpu.cu`, compiled by NVRTC, launched by the driver, in the order in which they run.
 
-The same functions as in `native`, on float32 tensors of one device. How a kernel runs is up to a `Launcher`:
-`CudaLauncher` has NVRTC compile and the driver launch them; the tests have one that runs the very same kernels
-on the CPU.
+The same functions as in `native`, on float32 tensors of one device. How a kernel runs is up to a `Launcher`; the tests
+have one that runs the very same kernels on the CPU.
 
 Everything is enqueued on torch's current stream. `rasterize` and `survey` wait for the device once, to learn how many
 pairs of Gaussian and tile there are to allocate (so they cannot be captured in a CUDA graph); `backward` never waits.
@@ -14,7 +13,6 @@ from __future__ import annotations
 import ctypes
 import functools
 import warnings
-from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -63,16 +61,6 @@ class Frame(PointingFrame):
         return self.tiles_x * -(-self.height // TILE)
 
 
-class Launcher(Protocol):
-    """Runs kernels of gpu.cu on one device."""
-
-    def launch(self, kernel: str, blocks: int, frame: Frame, rows: int = 1) -> None:
-        """Enqueue `kernel` on a grid of `blocks` x `rows` blocks of THREADS threads; `frame` is copied.
-
-        The kernels are those compiled for `frame.channels` colors (any where it is 0).
-        """
-
-
 def flags_for(channels: int) -> tuple[str, ...]:
     """What NVRTC, or nvcc, is told to compile the kernels for so many colors."""
     return (*FLAGS, f"-DD2_CHANNELS={channels}", f"-DD2_FRAME_SIZE={ctypes.sizeof(Frame)}")
@@ -89,15 +77,18 @@ def binary_for(capability: int, channels: int) -> Binary:
     return build("rasterizer", PROGRAM, flags_for(channels), capability)
 
 
-class CudaLauncher:
-    """Launches the kernels on one CUDA device, on torch's current stream."""
+class Launcher:
+    """Launches the kernels of gpu.cu on one CUDA device, on torch's current stream."""
 
     def __init__(self, device: torch.device) -> None:
         """Compile (or find) the kernels for `device`, as `Driver` does."""
         self._driver = Driver(device, lambda *variant: binary_for(*variant), CACHED_CHANNELS)
 
     def launch(self, kernel: str, blocks: int, frame: Frame, rows: int = 1) -> None:
-        """See `Launcher.launch`; returns before the kernel has run."""
+        """Enqueue `kernel` on a grid of `blocks` x `rows` blocks of THREADS threads; `frame` is copied.
+
+        The kernels are those compiled for `frame.channels` colors (any where it is 0).
+        """
         self._driver.launch(kernel, frame.channels or CACHED_CHANNELS, (blocks, rows), THREADS, frame)
 
 
@@ -108,7 +99,7 @@ def launcher(device: torch.device) -> Launcher:
     Raises:
         NoCuda: no driver, no NVRTC, or an architecture that it does not know.
     """
-    return CudaLauncher(device)
+    return Launcher(device)
 
 
 @functools.cache

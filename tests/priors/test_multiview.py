@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -17,10 +19,12 @@ from benchmarks.emulated_multiview import emulated_multiview
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.build import PriorSettings, build_priors
 from d2_plugin.priors.declared_error import held_against_truth
+from d2_plugin.priors.frame import Frame
 from d2_plugin.priors.multiview.fit import Vote, fitted, voted
+from d2_plugin.priors.multiview.moving import follow_images
 from d2_plugin.priors.multiview.predicted import prediction_files, read_prediction, understood
 from d2_plugin.priors.multiview.scale import MOST_POWER, pose_scale, power_of, world_scale
-from d2_plugin.priors.multiview.source import MultiviewMap
+from d2_plugin.priors.multiview.source import MultiviewMap, MultiviewSource
 from d2_plugin.priors.settings import StereoSettings
 from d2_plugin.protocol import Label
 from d2_plugin.recordings.cameras.rotations import rotation_of_vector
@@ -246,6 +250,42 @@ def test_a_source_that_shows_nothing_leaves_the_prior_as_it_is_or_nearly(
     assert (found & expected).sum() > 0.99 * expected.sum()
     every = Label.MONO, Label.AGREED
     assert median_error(room, store, *every) < 1.03 * median_error(room, without, *every)
+
+
+@pytest.mark.parametrize("moved_on", [0, 1, 2])
+def test_maps_of_other_instants_say_nothing_of_what_moves(
+    tmp_path: Path, moved_on: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Files with the numbers of other frames, here the next or the one after: their still part is used alone."""
+    long = synthetic_recording(cameras=3, held_out=0, frames=5, width=96, height=54, fps=1.0)
+    maps = write_multiview(long, NAMES, tmp_path / "right")
+    renamed = tmp_path / "renamed"
+    renamed.mkdir()
+    for frame in long.frames:
+        other = long.frames[(frame + moved_on) % len(long.frames)]
+        shutil.copyfile(maps / f"{other:05d}.npz", renamed / f"{frame:05d}.npz")
+    source = MultiviewSource(
+        *(long, NAMES, PriorSettings(multiview=str(renamed)), tmp_path / "cache"), partial(Frame.read, long, NAMES)
+    )
+    views = [(frame, *view) for frame in long.frames for view in source.views(Frame.read(long, NAMES, frame)).items()]
+    error = np.stack([np.log(map_.depth / long.depth(name, frame)) for frame, name, map_ in views])
+    unknown = np.stack([map_.confidence for _, _, map_ in views]) == 0
+    wrong = np.abs(error - np.median(error)) > 0.3
+    assert ("what moves in the maps is not what moves in the images" in caplog.text) == (moved_on > 0)
+    assert unknown.mean() < 0.2
+    assert not unknown.any() if moved_on == 0 else unknown[wrong].mean() > 0.7
+
+
+def test_where_nothing_moves_nothing_is_held_against_the_maps() -> None:
+    """Nor where all changes in its place, nor where images flicker and no map shows it; noise in each map is."""
+    rng = np.random.default_rng(0)
+    nothing, all_ = np.zeros((5, 1, 40, 40), bool), np.ones((5, 1, 40, 40), bool)
+    noise = rng.random((2, 5, 1, 40, 40)) < 0.2
+    assert follow_images(nothing, nothing)
+    assert follow_images(noise[0], nothing)
+    assert follow_images(noise[0], noise[0])
+    assert not follow_images(noise[0], noise[1])
+    assert follow_images(all_, all_)
 
 
 @pytest.mark.parametrize("factor", [1e-6, 1e6])

@@ -128,7 +128,7 @@ def shim_driver(compiler: nvrtc.Nvrtc, monkeypatch: pytest.MonkeyPatch, tmp_path
 
 def test_the_launcher_talks_to_the_driver(shim_driver: ctypes.CDLL, monkeypatch: pytest.MonkeyPatch) -> None:
     """Context, module, functions, frame and stream arrive; the kernels themselves run in the shim."""
-    use_shim(monkeypatch, cuda.CudaLauncher(torch.device("cuda", 0)))
+    use_shim(monkeypatch, cuda.Launcher(torch.device("cuda", 0)))
     scene, results = random_scene(0, 100, 32, 32), []
     for dtype in (torch.float32, torch.float64):
         leaves = scene.on(Where(dtype)).requires_grad()
@@ -144,13 +144,13 @@ def test_the_launcher_talks_to_the_driver(shim_driver: ctypes.CDLL, monkeypatch:
 def test_a_driver_that_refuses_the_kernels_is_named(shim_driver: ctypes.CDLL, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cuda, "binary_for", lambda *_: nvrtc.Binary(b"no cubin", "sm_90"))
     with pytest.raises(nvrtc.NoCuda, match=r"refuses kernels for sm_90 .*NO_BINARY.*: update the NVIDIA driver"):
-        cuda.CudaLauncher(torch.device("cuda", 0))
+        cuda.Launcher(torch.device("cuda", 0))
     assert shim_driver.d2_shim_contexts() == 0
 
 
 @pytest.mark.parametrize("grid", [(2**31, 1), (1, 65536)])
 def test_a_grid_that_no_device_launches_is_one_sentence(shim_driver: ctypes.CDLL, grid: tuple[int, int]) -> None:
-    launcher = cuda.CudaLauncher(torch.device("cuda", 0))
+    launcher = cuda.Launcher(torch.device("cuda", 0))
     with pytest.raises(D2Error, match=rf"a grid of {grid[0]} x {grid[1]} blocks, at most 2147483647 x 65535"):
         launcher.launch("d2_project", grid[0], cuda.frame_of(*empty_scene()), rows=grid[1])
     assert shim_driver.d2_shim_contexts() == 0
@@ -158,7 +158,7 @@ def test_a_grid_that_no_device_launches_is_one_sentence(shim_driver: ctypes.CDLL
 
 def test_a_launch_of_nothing_never_reaches_the_driver(shim_driver: ctypes.CDLL) -> None:
     """Which refuses an empty grid, as the real one does."""
-    cuda.CudaLauncher(torch.device("cuda", 0)).launch("d2_project", 0, cuda.frame_of(*empty_scene()))
+    cuda.Launcher(torch.device("cuda", 0)).launch("d2_project", 0, cuda.frame_of(*empty_scene()))
 
 
 def empty_scene() -> tuple:

@@ -18,13 +18,17 @@ pytest.importorskip("pycolmap", reason="pycolmap is in the `calibration` extra")
 from calibration_writers import CASES, Known, anipose, cameras_json, easymocap, panoptic, pose2sim, rig, transforms
 
 from d2_plugin.errors import D2Error
-from d2_plugin.recordings.cameras.calibration import open_calibration, read_calibration
+from d2_plugin.recordings.cameras.calibration import open_calibration
 from d2_plugin.recordings.cameras.camera import CalibratedCamera, scaled
 from d2_plugin.recordings.cameras.formats.cameras_json import camera_table
 from d2_plugin.recordings.files import arrange
 
 POINTS = np.random.default_rng(0).uniform(-0.6, 0.6, (200, 3))
 """In front of every camera of `rig`."""
+
+
+def cameras_of(path: Path, sizes: dict[str, tuple[int, int]] | None = None) -> tuple[CalibratedCamera, ...]:
+    return open_calibration(path, sizes).cameras
 
 
 def in_first_camera(cameras: list[Known]) -> list[Known]:
@@ -81,19 +85,19 @@ def test_a_folder_with_one_calibration_is_enough(tmp_path: Path) -> None:
 def test_recordings_of_another_size_scale_the_intrinsics(tmp_path: Path) -> None:
     cameras = rig()
     path = anipose(tmp_path, cameras)
-    (found,) = read_calibration(path, {"cam_1": (640, 360)})
+    (found,) = cameras_of(path, {"cam_1": (640, 360)})
     assert found.size == (640, 360)
     seen = (POINTS @ found.T_camera_world[:3, :3].T + found.T_camera_world[:3, 3]) @ found.pinhole().K.T
     half_size = found.lens.recorded_pixels(seen[:, :2] / seen[:, 2:])
     np.testing.assert_allclose(half_size, (cameras[1].project(POINTS) + 0.5) / 2, atol=0.01)
     with pytest.raises(D2Error, match="images of camera cam_1 are 720x1280 .* another aspect"):
-        read_calibration(path, {"cam_1": (720, 1280)})
+        cameras_of(path, {"cam_1": (720, 1280)})
 
 
 def test_our_own_json_says_everything(tmp_path: Path) -> None:
-    cameras = read_calibration(anipose(tmp_path, rig()))
+    cameras = cameras_of(anipose(tmp_path, rig()))
     (tmp_path / "cameras.json").write_text(json.dumps({"cameras": [camera_table(camera) for camera in cameras]}))
-    for again, known in zip(read_calibration(tmp_path / "cameras.json"), rig(), strict=True):
+    for again, known in zip(cameras_of(tmp_path / "cameras.json"), rig(), strict=True):
         assert_same(again, known, POINTS)
 
 
@@ -116,12 +120,12 @@ def test_names_that_only_some_files_have(tmp_path: Path) -> None:
     """Caliscope's numbers have gaps, and Multical's poses are called after a master camera where one was chosen."""
     path = CASES["caliscope"].write(tmp_path, rig())
     path.write_text(path.read_text().replace("cam_id = 1", "cam_id = 3\nrotation_count = -1\ngrid_count = 25"))
-    assert [camera.name for camera in read_calibration(path)] == ["cam_0", "cam_3", "cam_2"]
+    assert [camera.name for camera in cameras_of(path)] == ["cam_0", "cam_3", "cam_2"]
     path = CASES["multical"].write(tmp_path, rig())
     table = json.loads(path.read_text())
     table["camera_poses"] = {f"{name}_to_cam_0": pose for name, pose in table["camera_poses"].items()}
     path.write_text(json.dumps(table))
-    for camera, known in zip(read_calibration(path), rig(), strict=True):
+    for camera, known in zip(cameras_of(path), rig(), strict=True):
         assert_same(camera, known, POINTS)
 
 
@@ -173,7 +177,7 @@ def test_what_is_no_calibration_is_refused_in_one_sentence(
     write: Callable[[Path], Path], message: str, tmp_path: Path
 ) -> None:
     with pytest.raises(D2Error, match=message) as caught:
-        read_calibration(write(tmp_path))
+        cameras_of(write(tmp_path))
     assert "\n" not in str(caught.value)
 
 
@@ -182,10 +186,10 @@ def test_sizes_that_nobody_names_and_recordings_that_are_not_described(tmp_path:
     text = (tmp_path / "intri.yml").read_text()
     (tmp_path / "intri.yml").write_text("\n".join(line for line in text.splitlines() if line[:2] not in ("W_", "H_")))
     with pytest.raises(D2Error, match="names no size of the images of camera 00: give the recordings with it"):
-        read_calibration(tmp_path)
-    assert read_calibration(tmp_path, {"00": (1080, 1920)})[0].height == 1920
+        cameras_of(tmp_path)
+    assert cameras_of(tmp_path, {"00": (1080, 1920)})[0].height == 1920
     with pytest.raises(D2Error, match="no camera for cam_7, only cam_0, cam_1, cam_2"):
-        read_calibration(anipose(tmp_path, rig()), {"cam_7": (1280, 720)})
+        cameras_of(anipose(tmp_path, rig()), {"cam_7": (1280, 720)})
 
 
 class TestDamaged:
@@ -196,14 +200,14 @@ class TestDamaged:
         content = json.loads(path.read_text())
         del content["frames"][1]["camera_label"]
         path.write_text(json.dumps(content))
-        assert sorted(camera.name for camera in read_calibration(path)) == ["cam_0", "cam_1", "cam_2"]
+        assert sorted(camera.name for camera in cameras_of(path)) == ["cam_0", "cam_1", "cam_2"]
 
     @pytest.mark.parametrize("name", ["", "."])
     def test_a_image_without_a_name(self, name: str, tmp_path: Path) -> None:
         (tmp_path / "cameras.txt").write_text("1 PINHOLE 64 48 50 50 32 24\n")
         (tmp_path / "images.txt").write_text(f"1 1 0 0 0 0 0 0 1 {name}\n\n")
         with pytest.raises(D2Error):
-            read_calibration(tmp_path)
+            cameras_of(tmp_path)
         with pytest.raises(D2Error, match="every image needs the name of its file"):
             arrange([name], lambda group: True)
 
@@ -211,7 +215,7 @@ class TestDamaged:
         (tmp_path / "cameras.txt").write_text(f"1 {'P' * 9000} 64 48 50 50 32 24\n")
         (tmp_path / "images.txt").write_text("1 1 0 0 0 0 0 0 1 cam0/0.png\n\n")
         with pytest.raises(D2Error) as refusal:
-            read_calibration(tmp_path)
+            cameras_of(tmp_path)
         assert len(str(refusal.value)) < 1000
 
 
@@ -249,4 +253,4 @@ class TestNames:
     def test_two_cameras_of_one_number_are_not_guessed(self, tmp_path: Path) -> None:
         path = panoptic(tmp_path, rig(names=("00_01", "01_01", "02_05")))
         with pytest.raises(D2Error, match="has no camera for cam1, cam5"):
-            read_calibration(path, {"cam1": (1280, 720), "cam5": (1280, 720)})
+            cameras_of(path, {"cam1": (1280, 720), "cam5": (1280, 720)})

@@ -21,7 +21,7 @@ from d2_plugin.recordings.cameras.calibrating.bundle import Tracks
 from d2_plugin.recordings.cameras.calibrating.features import find_features, of_a_still_camera
 from d2_plugin.recordings.cameras.calibrating.sharpen import sharpened
 from d2_plugin.recordings.cameras.calibrating.solve import solve_features
-from d2_plugin.recordings.cameras.calibration import read_calibration
+from d2_plugin.recordings.cameras.calibration import open_calibration
 from d2_plugin.recordings.cameras.camera import pinhole, rig_width
 from d2_plugin.recordings.recording import Camera
 
@@ -191,7 +191,7 @@ def test_videos_become_a_recording_without_a_calibration(
     said = capsys.readouterr().out
     assert "camera 03: 0." in said
     assert f"scale: from the distance {apart:g} of 02 and 05" in said
-    found = {camera.name: camera.pinhole() for camera in read_calibration(tmp_path / "c" / "calibration.json")}
+    found = {camera.name: camera.pinhole() for camera in open_calibration(tmp_path / "c" / "calibration.json").cameras}
     degrees, share = worst(found, truth)
     assert degrees < 0.1
     assert share < 0.005

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import logging
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,8 +14,10 @@ from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.priors.frame import Frame, digest
 from d2_plugin.priors.maps_on_disk import planar
 from d2_plugin.priors.monocular.network import MonocularModel
+from d2_plugin.priors.multiview.moving import Instant, follow_images
 from d2_plugin.priors.multiview.predicted import Predicted, declared, prediction_files, read_prediction, understood
 from d2_plugin.priors.multiview.scale import log_ratio, world_scale
+from d2_plugin.priors.scene_flow import STILL_INSTANTS
 from d2_plugin.priors.settings import PriorSettings
 from d2_plugin.recordings.images import opencv
 from d2_plugin.recordings.recording import Camera, Recording
@@ -21,12 +25,13 @@ from d2_plugin.recordings.selection import spread
 from d2_plugin.store.files import EntryFolder, hash_of
 from d2_plugin.values import shown
 
+log = logging.getLogger(__name__)
+
 VERSION = 1  # raise it when this file changes what it returns, so that caches are not trusted
 SCALED_AT = 3
 """At so many instants, spread over the recording, its scale is measured; their median counts."""
 CROPPED = 0.05
 """Maps and images may differ by this share in their ratio of width to height: networks round to patches of 14."""
-
 
 CAMERAS = ("poses", "intrinsics")
 """What is cached of a prediction beside its maps."""
@@ -163,6 +168,38 @@ class MultiviewSource:
         return float(np.log(world_scale(maps, self.cameras, prediction.poses))) + self._against(number, first)
 
     def _predicted(self, number: int) -> Predicted:
+        """The prediction of one frame; nothing of what moves where the maps do not show that at their instants."""
+        found, still = self._read(number), self._still
+        if still is None:
+            return found
+        changed = np.logical_or(*self._instant(number).changes(still))
+        grown = [opencv("multi-view depth").dilate(view.astype(np.uint8), np.ones((3, 3))) for view in changed]
+        return found._replace(confidence=np.where(np.stack(grown), np.float32(0), found.confidence))
+
+    @functools.cached_property
+    def _still(self) -> Instant | None:
+        """What stands still, if what moves in the maps is not what moves in the images."""
+        some = spread([frame for frame in self.frames if self.has(frame)], STILL_INSTANTS)
+        if len(some) < 4:
+            return None  # what stands still is not known
+        instants = [self._instant(frame) for frame in some]
+        still = Instant(*(np.median(parts, axis=0) for parts in zip(*instants)))
+        if follow_images(*zip(*(instant.changes(still) for instant in instants))):
+            return None
+        log.warning(
+            "%s: what moves in the maps is not what moves in the images, so they are used for what stands still alone: "
+            "check that each file has the number of its frame", self.about,
+        )  # fmt: skip
+        return still
+
+    def _instant(self, number: int) -> Instant:
+        cv2, depth, images = opencv("multi-view depth"), self._read(number).depth, self.read(number).images
+        first = self._read(next(frame for frame in self.frames if self.has(frame))).depth
+        size = depth.shape[:0:-1]
+        small = [cv2.resize(images[name], size, interpolation=cv2.INTER_AREA) for name in self.cameras]
+        return Instant(np.stack(small).astype(np.float32), np.log(depth) - log_ratio(depth, first))
+
+    def _read(self, number: int) -> Predicted:
         """The prediction of one frame, of the training cameras in their order; the last two are kept."""
         if number not in self._last:
             found = self._computed(number) if self.model is not None else self._stored(self.files[number])

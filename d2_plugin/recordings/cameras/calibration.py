@@ -7,7 +7,6 @@ recordings as cameras. A way counts where it gives every recording one camera, a
 
 from __future__ import annotations
 
-import logging
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -26,8 +25,6 @@ from d2_plugin.recordings.cameras.formats.document import CORRECT, Document
 from d2_plugin.recordings.cameras.formats.easymocap import read_easymocap
 from d2_plugin.recordings.cameras.formats.transforms import read_transforms
 from d2_plugin.values import checked_arguments
-
-log = logging.getLogger(__name__)
 
 LARGE_RIG = 100.0
 """Rigs wider than this are noted: nobody films with two to ten cameras a hundred metres apart, while a room in
@@ -64,10 +61,8 @@ class Calibration:
 
 
 @checked_arguments
-def read_calibration(
-    path: Path | str, sizes: Mapping[str, tuple[int, int]] | None = None
-) -> tuple[CalibratedCamera, ...]:
-    """The cameras of a calibration file or folder in one of `FORMATS`; what is odd about it is logged.
+def open_calibration(path: Path | str, sizes: Mapping[str, tuple[int, int]] | None = None) -> Calibration:
+    """What a calibration file or folder in one of `FORMATS` says.
 
     Args:
         path: a file; or a folder that is a COLMAP model, holds intri.yml and extri.yml, or one calibration file.
@@ -78,15 +73,6 @@ def read_calibration(
         D2Error: one sentence for an unknown format, a recording that the file does not describe, and numbers that no
             camera has: among others rotations that are mirrored (left-handed) or not orthonormal.
     """
-    calibration = open_calibration(path, sizes)
-    for note in calibration.notes:
-        log.warning("%s: %s", Path(path).name, note)
-    return calibration.cameras
-
-
-@checked_arguments
-def open_calibration(path: Path | str, sizes: Mapping[str, tuple[int, int]] | None = None) -> Calibration:
-    """`read_calibration` with the name of the format and the notes, which it does not log."""
     if sizes is not None and not sizes:
         raise D2Error(f"{path} is read for no recording: name at least one with its size, or leave the sizes out")
     with reaching(path, CORRECT):
