@@ -22,11 +22,10 @@ def scores(backbone: Any, repository: str, truth: Path) -> dict[str, Any]:
     """Of the held-out cameras; `truth` is what `moving.save_truth` wrote. Nothing where no instant lies between."""
     stored = np.load(truth)
     trained, recording = stored["frames"].tolist(), Path(str(stored["recording"]))
-    whole = open_recording(recording, frames=range(trained[-1] + 1), downscale=int(stored["downscale"]))
-    frames, clock = whole.frames, TRIALS[repository].clock
-    if len(frames) == len(trained):
+    if len(trained) > trained[-1]:
         return {}
-    length = len(trained) * (trained[1] - trained[0])
+    whole = open_recording(recording, frames=range(trained[-1] + 1), downscale=int(stored["downscale"]))
+    frames, clock, length = whole.frames, TRIALS[repository].clock, len(trained) * (trained[1] - trained[0])
 
     def render(camera: str, frame: int) -> tuple[Tensor, Tensor]:
         view = make_view(whole, camera, frame)

@@ -8,17 +8,23 @@ import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 from mimics.workplace import furnish
 
-from benchmarks.trainers.bench import TrainersBench, run
-from benchmarks.trainers.moving import Moving
+from benchmarks.trainers import between
+from benchmarks.trainers.bench import TrainersBench, rows_of, run
+from benchmarks.trainers.moving import Moving, save_truth
 from benchmarks.trainers.page import read_rows, replaced, table
 from benchmarks.trainers.prepare import Prepared, Source
 from benchmarks.trainers.trials import TRIALS, Job, Trial
+from d2_plugin.errors import D2Error
+from d2_plugin.protocol import View
+from d2_plugin.recordings import open_recording
+from d2_plugin.viewing.rendering import RenderedView
 
 TESTS = Path(__file__).parents[1]
 
@@ -72,7 +78,9 @@ def true_images(folder: Path) -> Path:
     images = np.stack([np.full((4, 6, 3), 50, np.uint8), np.full((4, 6, 3), 150, np.uint8)])
     moves = np.zeros((2, 4, 6), bool)
     moves[:, :, :3] = True
-    np.savez(folder / "truth.npz", images=images, moving=moves, held_out=np.array([False, True]))
+    np.savez(
+        folder / "truth.npz", images=images, moving=moves, held_out=np.array([False, True]), frames=[0], recording=""
+    )
     return folder / "truth.npz"
 
 
@@ -87,6 +95,32 @@ def test_what_moves_is_scored_in_held_out_views_alone_and_the_last_comparison_co
         moving.see(image, held_out)
     moving.see(torch.zeros(3, 4, 6), torch.ones(3, 4, 6))  # an image that the recording does not have
     assert moving.score() == pytest.approx(20.0, abs=1e-3), "the still half is exact and does not count"
+
+
+@pytest.mark.parametrize("repository", ["spacetime", "fudan"])
+def test_instants_between_are_asked_for_in_the_trainers_own_time(
+    repository: str, shared_data: Callable[[str], Path], tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    """A model that shows the true image of the time it is asked for has no error, at trained instants and between."""
+    studio = open_recording(shared_data("studio"), downscale=4)
+    truth = save_truth(shared_data("studio"), [0, 2, 4], 4, tmp_path / "truth.npz")
+    unit = 1 / studio.fps if repository == "fudan" else 1 / 6  # three instants, two frames apart
+
+    def drawn(backbone: object, view: View) -> RenderedView:
+        image = studio.image(view.camera, round(view.time / unit))
+        found = torch.from_numpy(image).float() / 255
+        return RenderedView(found + 0.01, found[..., 0], found[..., 0], None)
+
+    monkeypatch.setattr(between, "render_view", drawn)
+    found = between.scores(SimpleNamespace(view=lambda view: view), repository, truth)
+    assert found == pytest.approx({"psnr_moving": 40, "psnr_moving_between": 40}, abs=0.3)  # all but what is white
+    assert between.scores(None, repository, save_truth(shared_data("studio"), [0, 1], 4, tmp_path / "all.npz")) == {}
+
+
+def test_a_trainer_whose_time_is_not_known_is_not_asked_between(tmp_path: Path) -> None:
+    with pytest.raises(D2Error, match="gsplat is not scored between instants: give --only fudan, hust4d, spacetime"):
+        list(rows_of("gsplat", TrainersBench(tmp_path, (tmp_path,), hold_out_instants=2)))
 
 
 class TestTrials:
