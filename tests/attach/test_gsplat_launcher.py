@@ -161,7 +161,7 @@ def test_the_export_that_the_parser_reads_renames_the_cameras(tmp_path: Path, mo
     monkeypatch.setattr(exported, "export_read", lambda prior, source: read.append(source))
     session = GsplatSession(recipe("gsplat"), D2Config(prior="prior"))
     session.objects.scene = SimpleNamespace(data_dir=str(tmp_path))
-    assert session._configured(40) == D2Config(prior="prior")
+    assert session._configured(40, int) == D2Config(prior="prior")
     assert read == [tmp_path]
 
 

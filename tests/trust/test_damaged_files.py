@@ -33,7 +33,7 @@ from d2_plugin.priors.monocular.network import MonocularModel
 from d2_plugin.protocol import EXPORT_FILE, Label
 from d2_plugin.reading import read_json
 from d2_plugin.recordings import open_recording
-from d2_plugin.recordings.cameras.calibration import read_calibration
+from d2_plugin.recordings.cameras.calibration import open_calibration
 from d2_plugin.recordings.cameras.formats.colmap import find_model, read_points
 from d2_plugin.recordings.export.export import export_recording
 from d2_plugin.recordings.images import image_size, read_image, write_png
@@ -178,7 +178,7 @@ def calibration(path: Path, name: str) -> Callable[[], object]:
     cameras = rig(case.coefficients, case.fisheye, case.names)
     file = case.write(path, cameras)
     sizes = None if case.sizes else {camera.name: camera.size for camera in cameras}
-    return lambda: [camera.lens.bends for camera in read_calibration(file, sizes)]
+    return lambda: [camera.lens.bends for camera in open_calibration(file, sizes).cameras]
 
 
 def a_store(folder: Path) -> tuple[Path, Callable[[], Any]]:

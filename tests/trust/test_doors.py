@@ -25,7 +25,7 @@ from d2_plugin.config import D2Config
 from d2_plugin.errors import D2Error
 from d2_plugin.recordings import Recording, open_recording, select_cameras, select_frames
 from d2_plugin.recordings.cameras.calibrating import Board, refine, scaled_by_board, solve_rig
-from d2_plugin.recordings.cameras.calibration import read_calibration
+from d2_plugin.recordings.cameras.calibration import open_calibration
 from d2_plugin.recordings.cameras.camera import scaled
 from d2_plugin.recordings.cameras.formats.document import Document
 from d2_plugin.recordings.cameras.undistort import Undistortion
@@ -123,7 +123,7 @@ def test_a_sentence_that_repeats_a_damaged_file_is_short(tmp_path: Path) -> None
     )
     (tmp_path / "camchain.yaml").write_text(f"cam0:\n  {camera}\n")
     with pytest.raises(D2Error) as refusal:
-        read_calibration(tmp_path / "camchain.yaml")
+        open_calibration(tmp_path / "camchain.yaml")
     assert len(str(refusal.value)) < 1300
     assert str(refusal.value).endswith("calibrate it with Kalibr's pinhole-equi or pinhole-radtan")
 
@@ -257,7 +257,7 @@ def as_a_path(path: Path) -> dict[str, Call]:
     """What takes the place of a file or folder."""
     return {
         "open_recording": open_recording,
-        "read_calibration": read_calibration,
+        "open_calibration": open_calibration,
         "PriorStore.open": PriorStore.open,
         "D2Config.from_toml": D2Config.from_toml,
         "Run.load": Run.load,
@@ -268,7 +268,7 @@ def as_a_path(path: Path) -> dict[str, Call]:
 
 def of_a_recording(path: Path, recording: Recording) -> dict[str, Call]:
     """What stands for a recording, its cameras, frames and sizes."""
-    (first, *_) = read_calibration(path / "calibration.json")
+    (first, *_) = open_calibration(path / "calibration.json").cameras
     folder = path.parent / "never"
     return {
         "cameras": lambda wrong: open_recording(path, cameras=wrong if wrong is not None else "train0"),
@@ -279,7 +279,7 @@ def of_a_recording(path: Path, recording: Recording) -> dict[str, Call]:
         "select_frames": lambda wrong: select_frames(recording, wrong),
         "a camera's image": lambda wrong: recording.image(wrong, 0),
         "a frame's image": lambda wrong: recording.image("train0", "0" if wrong is True or wrong == 5 else wrong),
-        "sizes": lambda wrong: read_calibration(path / "calibration.json", wrong if wrong is not None else {}),
+        "sizes": lambda wrong: open_calibration(path / "calibration.json", wrong if wrong is not None else {}),
         "scaled": lambda wrong: scaled([first], -1 if wrong in (5, 1.5) else wrong),
         "Undistortion": Undistortion,
         "an undistorted image": Undistortion(first).image,

@@ -1,4 +1,4 @@
-"""Calibration files of other tools: the formats in one table, and `read_calibration`, which finds the right one.
+"""Calibration files of other tools: the formats in one table, and `open_calibration`, which finds the right one.
 
 Which camera of a file belongs to which recording, in this order: equal names; one name that holds the other (hd_00_05
 and 00_05); equal last numbers (int_cam1_img and cam01); and, with a note, the order of names where there are as many

@@ -17,7 +17,7 @@ from rigs import arc, held, worst
 from d2_plugin.commands.cli import main
 from d2_plugin.durable import read_table
 from d2_plugin.recordings import open_recording, select_cameras, select_frames
-from d2_plugin.recordings.cameras.calibration import read_calibration
+from d2_plugin.recordings.cameras.calibration import open_calibration
 from d2_plugin.recordings.cameras.camera import pinhole, rig_width, rigid
 from d2_plugin.recordings.cameras.epipolar import rotated
 from d2_plugin.recordings.export.folder import described
@@ -70,7 +70,7 @@ def test_four_webcams_with_a_board_are_placed_in_metres(webcams: tuple, tmp_path
     assert main(words) == 0
     said = capsys.readouterr().out
     assert "the board was seen by c0 in" in said
-    found = {one.name: one.pinhole() for one in read_calibration(tmp_path / "c" / "calibration.json")}
+    found = {one.name: one.pinhole() for one in open_calibration(tmp_path / "c" / "calibration.json").cameras}
     degrees, share = worst(found, truth)
     assert degrees < 0.2
     assert share < 0.005
