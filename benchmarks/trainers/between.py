@@ -4,6 +4,7 @@ A trainer's own test set holds the instants that it trains, so the model is aske
 attached alike, and drawn by our rasterizer.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,13 +19,17 @@ from d2_plugin.runs.start import make_view
 from d2_plugin.viewing.rendering import render_view
 
 
-def scores(backbone: Any, repository: str, truth: Path) -> dict[str, Any]:
-    """Of the held-out cameras; `truth` is what `moving.save_truth` wrote. Nothing where no instant lies between."""
+def scores(adapted: Callable[[], Any], repository: str, truth: Path) -> dict[str, Any]:
+    """Of the held-out cameras; `truth` is what `moving.save_truth` wrote. Nothing where no instant lies between.
+
+    `adapted` makes the adapter of the trained model, where it is needed.
+    """
     stored = np.load(truth)
     trained, recording = stored["frames"].tolist(), Path(str(stored["recording"]))
     if len(trained) > trained[-1]:
         return {}
     whole = open_recording(recording, frames=range(trained[-1] + 1), downscale=int(stored["downscale"]))
+    backbone = adapted()
     frames, clock, length = whole.frames, TRIALS[repository].clock, len(trained) * (trained[1] - trained[0])
 
     def render(camera: str, frame: int) -> tuple[Tensor, Tensor]:

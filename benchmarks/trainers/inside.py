@@ -59,7 +59,7 @@ def main(words: list[str]) -> int:
         assert sys.__stdout__ is not None  # the trainers' safe_state puts another sys.stdout into its place
         sys.__stdout__.write(f"\n[held out] iteration {objects.options.iterations}: PSNR {psnr}\n")
     outcome |= {"psnr_moving": moving.score(), "peak_mb": peak_mb}
-    outcome |= between.scores(session.recipe.backbone(objects), options.repository, Path(truth))
+    outcome |= between.scores(lambda: session.recipe.backbone(objects), options.repository, Path(truth))
     Path(outcome_file).write_text(json_text(outcome, outcome_file), encoding="utf-8")
     return 0
 

@@ -113,7 +113,7 @@ def test_instants_between_are_asked_for_in_the_trainers_own_time(
         return RenderedView(found + 0.01, found[..., 0], found[..., 0], None)
 
     monkeypatch.setattr(between, "render_view", drawn)
-    found = between.scores(SimpleNamespace(view=lambda view: view), repository, truth)
+    found = between.scores(lambda: SimpleNamespace(view=lambda view: view), repository, truth)
     assert found == pytest.approx({"psnr_moving": 40, "psnr_moving_between": 40}, abs=0.3)  # all but what is white
     assert between.scores(None, repository, save_truth(shared_data("studio"), [0, 1], 4, tmp_path / "all.npz")) == {}
 
