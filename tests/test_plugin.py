@@ -278,7 +278,7 @@ def test_what_was_there_before_stays_where_the_cap_is_below_it(caplog: pytest.Lo
     before = len(make_adapter(make_model()))
     _, counts = grown(before - 5)
     assert counts == [before] * 4
-    assert f"{before + 10} Gaussians, so none are inserted: max_gaussians = {before - 5}" in caplog.text
+    assert f"step 1: {before + 10} Gaussians, so none are inserted: max_gaussians = {before - 5}" in caplog.text
 
 
 def test_the_faintest_of_the_newest_go() -> None:

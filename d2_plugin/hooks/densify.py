@@ -199,7 +199,7 @@ class Densify(Hook):
         if room <= 0 and not self._full:
             self._full = True
             count = len(context.backbone)
-            log.warning("%d Gaussians, so none are inserted: max_gaussians = %d", count, most)
+            log.warning("step %d: %d Gaussians, so none are inserted: max_gaussians = %d", context.step, count, most)
         inserted: list[Points] = []
         for surveyed, lives in (
             *((surveyed, self._lifetimes(surveyed.view, context)) for surveyed in context.evaluation),
