@@ -38,6 +38,8 @@ class TrainersBench(Settings):
     """Which runs of each: bare, no hooks, attached, with motion."""
     iterations: Annotated[int, Range(10, unit="iterations")] = 300
     """Length of each run."""
+    own_schedules: bool = False
+    """Leave what counts iterations (densification, learning rates) as each script has it, not shortened."""
     seeds: tuple[Seed, ...] = (0,)
     """Added to every seed that a script sets; 0 is the script as it is. A claim needs three."""
     frames: Annotated[int, Range(2)] = 9
@@ -92,7 +94,10 @@ def rows_of(name: str, settings: TrainersBench) -> Iterator[Row]:
             for method in settings.methods:
                 folder = settings.work / "runs" / f"{name}-{recording.name}-{method.replace(' ', '-')}-{seed}"
                 checkout = settings.checkouts / trial.folder
-                row = trial_row(name, trial, checkout, prepared, folder, method, settings.iterations, seed)
+                row = trial_row(
+                    *(name, trial, checkout, prepared, folder, method, settings.iterations, seed),
+                    own_schedules=settings.own_schedules,
+                )
                 yield row | circumstances() | {"command": command}
 
 

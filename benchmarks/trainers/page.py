@@ -37,7 +37,7 @@ def read_rows(path: Path) -> list[Row]:
     return list(latest.values())
 
 
-_CASE = ("repository", "recording", "frames", "downscale", "iterations", "hold_out_instants")
+_CASE = ("repository", "recording", "frames", "downscale", "iterations", "own_schedules", "hold_out_instants")
 _SAME = (*_CASE, "seed", "method")
 
 
@@ -61,7 +61,7 @@ def _line(case: tuple, rows: list[Row]) -> tuple[str, ...]:
     bare, attached = ([row for row in finished if row["method"] == name and row["psnr"]] for name in (BARE, ATTACHED))
     gains = [last(other) - last(row) for row, other in pairs(bare, attached)]
     return (
-        *(str(case[0]), str(case[1]), str(case[4])),
+        *(str(case[0]), str(case[1]), f"{case[4]}, its own schedules" if case[5] else str(case[4])),
         *(_spread([last(row) for row in bare]), same(bare, without), _spread([last(row) for row in attached])),
         *(_spread(gains, sign="+"), _moving(bare, attached)),
         " → ".join(_mean(some, "gaussians") for some in (bare, attached)),

@@ -27,18 +27,28 @@ LONGEST = 3600
 
 
 def trial_row(
-    name: str, trial: Trial, checkout: Path, prepared: Prepared, folder: Path, method: str, iterations: int, seed: int
+    name: str,
+    trial: Trial,
+    checkout: Path,
+    prepared: Prepared,
+    folder: Path,
+    method: str,
+    iterations: int,
+    seed: int,
+    *,
+    own_schedules: bool = False,
 ) -> Row:
     """Run it and say how well it did, by its own report, or why it did not."""
     source = prepared.source
     row: Row = {"repository": name, "source": trial.source, "checkout": commit_of(checkout)}
     row |= {"recording": source.recording.name, "frames": source.frames, "downscale": source.downscale}
     row |= {"hold_out_instants": source.step} if source.step > 1 else {}
+    row |= {"own_schedules": True} if own_schedules else {}
     row |= {"method": method, "iterations": iterations, "seed": seed}
     row |= {"scored_on": trial.scored_on, "psnr": {}, "failed": None}
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
-    job = Job(prepared.data, folder.resolve(), iterations, source.frames, source.seconds)
+    job = Job(prepared.data, folder.resolve(), iterations, source.frames, source.seconds, own_schedules)
     code, printed = _run(_words(name, trial, job, prepared, method, seed), checkout, job.output / "log.txt")
     outcome = job.output / "outcome.json"
     if code != 0 or not outcome.is_file():

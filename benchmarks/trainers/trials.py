@@ -1,7 +1,8 @@
 """What each official trainer needs for a short run: its layout, its arguments, and where it says how well it did.
 
 Nothing of a repository is copied here: these are the names of its options, with values for a few hundred iterations.
-A schedule that counts iterations is shortened in proportion, so that densification takes place within the run.
+A schedule that counts iterations is shortened in proportion, so that densification takes place within the run, or is
+left as the script has it.
 """
 
 import re
@@ -29,6 +30,8 @@ class Job:
     frames: int
     seconds: float
     """Length of the clip."""
+    own_schedules: bool = False
+    """Leave schedules as the script has them."""
 
     @property
     def model(self) -> Path:
@@ -44,6 +47,14 @@ class Job:
     def share(self, part: float) -> int:
         """That part of the iterations, at least one."""
         return max(1, round(part * self.iterations))
+
+    def schedule(self, parts: dict[str, float]) -> dict[str, int]:
+        """Options that count iterations, as parts of the run; none where the script's own stay."""
+        return {} if self.own_schedules else {name: self.share(part) for name, part in parts.items()}
+
+    def schedule_words(self, parts: dict[str, float]) -> list[str]:
+        """The same as arguments of a script."""
+        return [word for name, count in self.schedule(parts).items() for word in (f"--{name}", str(count))]
 
     @property
     def reports(self) -> list[str]:
@@ -114,6 +125,13 @@ class Trial:
         return self.source.rpartition("/")[2]
 
 
+DENSIFY = {
+    **{"densify_from_iter": 0.2, "densify_until_iter": 0.8, "densification_interval": 0.1},
+    "position_lr_max_steps": 1.0,
+}
+"""What most scripts call these parts of a run."""
+
+
 def _fudan(job: Job) -> list[str]:
     config = {
         **{"gaussian_dim": 4, "time_duration": [0.0, job.seconds], "num_pts": 100000, "num_pts_ratio": 1.0},
@@ -124,9 +142,9 @@ def _fudan(job: Job) -> list[str]:
         },
         "PipelineParams": {"env_map_res": 0, "eval_shfs_4d": True},
         "OptimizationParams": {
-            **{"iterations": job.iterations, "position_lr_max_steps": job.iterations, "lambda_rigid": 0.0},
-            **{"densification_interval": job.share(0.25), "densify_from_iter": job.share(0.4)},
-            **{"densify_until_iter": job.share(0.8), "sh_increase_interval": job.share(0.25)},
+            **{"iterations": job.iterations, "lambda_rigid": 0.0},
+            **job.schedule(DENSIFY | {"densification_interval": 0.25, "densify_from_iter": 0.4}),
+            **job.schedule({"sh_increase_interval": 0.25}),
         },
     }
     path = job.write("config.yaml", json_text(config, "config.yaml", indent=1))  # JSON is YAML
@@ -140,9 +158,7 @@ def _4c4d(job: Job) -> list[str]:
 def _deformable3d(job: Job) -> list[str]:
     return [
         *("-s", str(job.data), "-m", str(job.model), "--eval", "--iterations", str(job.iterations)),
-        *("--warm_up", str(job.share(0.25)), "--densify_from_iter", str(job.share(0.3))),
-        *("--densify_until_iter", str(job.share(0.8)), "--densification_interval", str(job.share(0.1))),
-        *("--position_lr_max_steps", str(job.iterations), "--deform_lr_max_steps", str(job.iterations)),
+        *job.schedule_words(DENSIFY | {"warm_up": 0.25, "densify_from_iter": 0.3, "deform_lr_max_steps": 1.0}),
         *("--test_iterations", *job.reports),
     ]
 
@@ -150,8 +166,7 @@ def _deformable3d(job: Job) -> list[str]:
 def _hust4d(job: Job) -> list[str]:
     optimization = {
         **{"dataloader": True, "iterations": job.iterations, "batch_size": 1, "coarse_iterations": job.share(1 / 3)},
-        **{"densify_from_iter": job.share(0.2), "densification_interval": job.share(0.1)},
-        **{"densify_until_iter": job.share(0.8), "position_lr_max_steps": job.iterations},
+        **job.schedule(DENSIFY),
         **{"opacity_threshold_coarse": 0.005, "opacity_threshold_fine_init": 0.005},
         "opacity_threshold_fine_after": 0.005,
     }
@@ -170,8 +185,7 @@ def _spacetime(job: Job) -> list[str]:
     config: dict[str, Any] = {
         **{"resolution": 1, "model": "ours_lite", "scaling_lr": 0.0015, "preprocesspoints": 0, "batch": 2},
         **{"duration": job.frames, "rdpip": "train_ours_lite", "iterations": job.iterations},
-        **{"densify_from_iter": job.share(0.2), "densify_until_iter": job.share(0.8)},
-        **{"densification_interval": job.share(0.1), "position_lr_max_steps": job.iterations},
+        **job.schedule(DENSIFY),
     }
     return [
         *("--eval", "--source_path", str(job.data / "colmap_0"), "--model_path", str(job.model)),
@@ -184,10 +198,8 @@ def _ex4dgs(job: Job, extraction: str = "extracton_interval") -> list[str]:
     config = {
         **{"loader": "neural3dvideo", "resolution": 1, "iterations": job.iterations, "lazy_loader": True},
         **{"duration": job.frames, "start_duration": job.frames, "end_timestamp": job.frames},
-        **{"densify_from_iter": job.share(0.2), "densify_until_iter": job.share(0.8)},
-        **{"densification_interval": job.share(0.1), "extract_from_iter": job.share(0.25)},
-        **{extraction: job.share(0.15), "progressive_growing_steps": 100000},
-        **{"position_lr_max_steps": job.iterations, "dynamic_position_lr_max_steps": job.iterations},
+        **job.schedule(DENSIFY | {"extract_from_iter": 0.25, extraction: 0.15, "dynamic_position_lr_max_steps": 1.0}),
+        "progressive_growing_steps": 100000,
     }
     path = job.write("config.json", json_text(config, "config.json"))
     words = ["-s", str(job.data), "-m", str(job.model), "--configpath", path]
@@ -199,13 +211,12 @@ def _cem4dgs(job: Job) -> list[str]:
 
 
 def _gsplat(job: Job) -> list[str]:
-    third = str(job.share(1 / 3))
+    refine = {"strategy.refine_start_iter": 0.2, "strategy.refine_every": 0.1, "strategy.refine_stop_iter": 0.8}
     return [
         *("default", "--disable_viewer", "--disable_video", "--no-normalize_world_space", "--no-load_exposure"),
         *("--data_dir", str(job.data), "--data_factor", "1", "--result_dir", str(job.model), "--test_every", "2"),
         *("--max_steps", str(job.iterations), "--eval_steps", *job.reports, "--tb_every", "0"),
-        *("--strategy.refine_start_iter", str(job.share(0.2)), "--strategy.refine_every", str(job.share(0.1))),
-        *("--strategy.refine_stop_iter", str(job.share(0.8)), "--sh_degree_interval", third),
+        *job.schedule_words(refine | {"sh_degree_interval": 1 / 3}),
     ]
 
 

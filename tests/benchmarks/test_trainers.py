@@ -62,6 +62,11 @@ class TestTable:
         assert cells[3:7] == ["21.00", "the same bits", "24.00", "+3.00"]
         assert cells[7:] == ["-", "1000 → 1500", "600 / 100", "- → -", "- → -", "-0.50 at 50"]
 
+    def test_runs_with_the_scripts_own_schedules_have_a_line_of_their_own(self) -> None:
+        lines = table([*ROWS, row("bare", {"200": 20.5}, own_schedules=True)]).splitlines()
+        assert "| 200, its own schedules | 20.50 | - | - |" in lines[-1]
+        assert "| 200 | 21.00 |" in lines[-2]
+
     def test_what_moves_is_compared_where_both_were_scored(self) -> None:
         bare, attached = row("bare", {"200": 21.0}, psnr_moving=18.0), row("attached", {"200": 24.0}, psnr_moving=20.5)
         assert "| 18.00 → 20.50, +2.50 |" in table([bare, attached])
@@ -124,15 +129,17 @@ def test_a_trainer_whose_time_is_not_known_is_not_asked_between(tmp_path: Path) 
 
 
 class TestTrials:
+    @pytest.mark.parametrize("own", [False, True])
     @pytest.mark.parametrize("name", TRIALS)
-    def test_its_script_is_told_data_length_and_place(self, name: str, tmp_path: Path) -> None:
-        asked = job(tmp_path)
+    def test_its_script_is_told_data_length_place_and_schedule(self, name: str, own: bool, tmp_path: Path) -> None:
+        asked = replace(job(tmp_path), own_schedules=own)
         words = TRIALS[name].words(asked)
         told = " ".join([*words, *(path.read_text() for path in tmp_path.iterdir() if path.is_file())])
         assert str(asked.data) in told
         assert str(asked.model) in told
         assert "200" in told
         assert not asked.model.exists(), "4C4D refuses a folder that is there"
+        assert own != any(name in told for name in ("densify_from_iter", "strategy.refine_start_iter"))
 
 
 TRAIN = """
