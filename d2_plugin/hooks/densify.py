@@ -37,6 +37,9 @@ INSTANTS = 9
 FEWEST = 3
 """With fewer there is no median to differ from."""
 
+CANDIDATES = 8
+"""Random pixels to choose from for each Gaussian that the budget allows: one square in 3,000 then has none of them."""
+
 MOST = 1_000_000
 """Gaussians up to which there is insertion, where `max_gaussians` is not set."""
 
@@ -228,10 +231,11 @@ class Densify(Hook):
         depth, valid = rendered_depth(surveyed.survey.depth_sum, surveyed.survey.alpha, config.tau_v)
         region = under_reconstructed(depth, valid, prior.depth, prior.support, self._tau_u(prior))
         pixels = shuffled_pixels(region, generator)
+        spacing = max(config.spacing, math.sqrt(len(pixels) / budget))
+        pixels = pixels[: CANDIDATES * budget]
         column, row = pixels.unbind(-1)
         target = prior.depth[row, column].float()  # as the Gaussians are
         positions = back_project(view, pixels, target)
-        spacing = max(config.spacing, math.sqrt(len(pixels) / budget))
         free = torch.nonzero(self._free(view, surveyed.splats, positions, earlier, spacing)).squeeze(1)[:budget]
         colors = (
             prior.colors[row, column].to(target) / 255 if prior.colors is not None else torch.full_like(positions, 0.5)

@@ -59,8 +59,9 @@ class HookConfig(Settings):
 
 
 def steps_between_evaluations(iterations: int, least: int) -> int:
-    """Of hooks that edit structure: a hundred, in short runs a twentieth of the run and `least` at least."""
-    return max(least, min(100, iterations // 20))
+    """Of hooks that edit structure: a hundred, in short runs a twentieth of the run, or a tenth and ten; `least` at
+    least. An evaluation costs as much as several steps."""
+    return max(least, min(10, iterations // 10), min(100, iterations // 20))
 
 
 class Surveyed(NamedTuple):
