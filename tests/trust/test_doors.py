@@ -136,13 +136,18 @@ def test_a_cache_that_cannot_be_is_one_sentence(monkeypatch: pytest.MonkeyPatch)
     assert "delete" not in str(refusal.value)
 
 
-def test_links_in_a_circle_are_one_sentence(recording: Path, tmp_path: Path, refused: Refused) -> None:
+def test_links_in_a_circle_pipes_and_devices_are_one_sentence(
+    recording: Path, tmp_path: Path, refused: Refused
+) -> None:
     pytest.importorskip("av")
     (tmp_path / "videos").mkdir()
-    for loop in (tmp_path / "loop", tmp_path / "videos" / "cam00.mp4"):
-        loop.symlink_to(loop)
+    loop, video = tmp_path / "loop", tmp_path / "videos" / "cam00.mp4"
+    loop.symlink_to(loop)
     calibration = ["--calibration", recording / "cameras.json"]
-    refused("import", tmp_path / "videos", *calibration, "--output", tmp_path / "out")
+    for place in (lambda: video.symlink_to(loop), lambda: os.mkfifo(video), lambda: video.symlink_to("/dev/zero")):
+        place()
+        refused("import", tmp_path / "videos", *calibration, "--output", tmp_path / "out")
+        video.unlink()
     refused("import", tmp_path / "loop", *calibration, "--output", tmp_path / "out")
     refused("train", recording, "--train-cameras", "cam00", "--output", tmp_path / "loop")
     refused("export-recording", recording, "--format", "n3dv", "--output", tmp_path / "loop")
