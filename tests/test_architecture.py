@@ -6,7 +6,7 @@ import ast
 import configparser
 import functools
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from graphlib import TopologicalSorter
 from pathlib import Path
 
@@ -53,12 +53,13 @@ DOCUMENT = re.compile(r"(?<![\w./:{}*~<-])((?:[\w.-]+/)+[\w-]+\.md)\b")
 LINK = re.compile(r"\]\((?![a-z]+:|#)([^)#\s]+)[^)]*\)")
 
 
-def modules_in(root: Path, packages: Mapping[str, str]) -> dict[str, Path]:
+@functools.cache
+def modules() -> dict[str, Path]:
     """Every module by its name as it is installed."""
     found = {}
-    for package, folder in packages.items():
-        for path in sorted((root / folder).rglob("*.py")):
-            parts = path.relative_to(root / folder).with_suffix("").parts
+    for package, folder in PACKAGES.items():
+        for path in sorted((ROOT / folder).rglob("*.py")):
+            parts = path.relative_to(ROOT / folder).with_suffix("").parts
             found[".".join([package, *parts]).removesuffix(".__init__")] = path
     return found
 
@@ -70,17 +71,16 @@ def room(module: str) -> str:
 
 
 @functools.cache
-def parsed(path: Path) -> ast.Module:
-    return ast.parse(path.read_text(encoding="utf-8"))
-
-
-def imports_of(name: str, modules: Mapping[str, Path]) -> Iterator[tuple[str, int, bool]]:
+def imports_of(name: str) -> list[tuple[str, int, bool]]:
     """Each module of this project that a module imports, the line, and whether importing the one loads the other."""
-    parts = name.split(".") if modules[name].name == "__init__.py" else name.split(".")[:-1]
+    path = modules()[name]
+    parts = name.split(".") if path.name == "__init__.py" else name.split(".")[:-1]
 
     def walk(node: ast.AST, at_once: bool) -> Iterator[tuple[str, int, bool]]:
         for child in ast.iter_child_nodes(node):
-            inside = isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda)
+            if isinstance(child, ast.expr):
+                continue  # holds no import
+            inside = isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef)
             inside |= isinstance(child, ast.If) and any(
                 getattr(n, "id", "") == "TYPE_CHECKING" for n in ast.walk(child.test)
             )
@@ -91,71 +91,49 @@ def imports_of(name: str, modules: Mapping[str, Path]) -> Iterator[tuple[str, in
                 above = parts[: len(parts) - child.level + 1] if child.level else []
                 base = ".".join([*above, *([child.module] if child.module else [])])
                 names = [f"{base}.{alias.name}" for alias in child.names]
-                targets = [full if full in modules else base for full in names]
-            yield from ((target, child.lineno, at_once) for target in targets if target in modules)
+                targets = [full if full in modules() else base for full in names]
+            yield from ((target, child.lineno, at_once) for target in targets if target in modules())
             yield from walk(child, at_once and not inside)
 
-    return walk(parsed(modules[name]), True)
-
-
-def wrong_arrows(modules: Mapping[str, Path], rooms: Mapping[str, str], ground: str) -> list[str]:
-    """Imports that `rooms` does not allow, one sentence each; `ground` is what that word stands for in the table."""
-    wrong = []
-    for name in modules:
-        own = room(name)
-        words = rooms.get("ground" if own in ground.split() else own, "").replace("ground", ground).split()
-        for target, line, at_once in imports_of(name, modules):
-            allowed = {own, *(word if at_once else word.strip("()") for word in words)}
-            if room(target) not in allowed:
-                wrong.append(f"{name}, line {line}, imports {target}, but {own} may not import {room(target)}")
-    return sorted(set(wrong))
-
-
-def unpackaged(root: Path, setup: configparser.ConfigParser) -> list[str]:
-    """What setup.cfg's `packages` and `package_data` say and the tree does not, and the other way round."""
-    places = dict(re.split(r"\s*=\s*", line) for line in setup["options"]["package_dir"].split("\n") if line.strip())
-    listed = {name: root / places.get(name, name.replace(".", "/")) for name in setup["options"]["packages"].split()}
-    tops = [root / "d2_plugin", *(root / place for place in places.values())]
-    packages = {path.parent for top in tops for path in top.rglob("__init__.py")}
-    wrong = [f"{folder.relative_to(root)} is listed or a package, not both" for folder in packages ^ {*listed.values()}]
-    covered = set()
-    for package, patterns in setup["options.package_data"].items():
-        for pattern in re.split(r"[,\s]+", patterns.strip()):
-            matches = set(listed[package].glob(pattern))
-            wrong += [] if matches else [f"package_data's {package} = {pattern} matches no file"]
-            covered |= matches
-    every = {path for top in tops for path in top.rglob("*") if path.is_file() and path.suffix not in (".py", ".pyc")}
-    beside = {path.relative_to(root) for path in every - covered}
-    return sorted(wrong + [f"{path} is in no package_data" for path in beside if not re.search(r"(^|/)\.", str(path))])
-
-
-def missing_documents(root: Path, files: Iterable[Path]) -> list[str]:
-    """References in `files` to Markdown files or to link targets that are not in the tree under `root`."""
-    wrong = []
-    for path in files:
-        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
-            names = DOCUMENT.findall(line) + (LINK.findall(line) if path.suffix == ".md" else [])
-            missing = [name for name in names if not ((root / name).exists() or (path.parent / name).exists())]
-            wrong += [f"{path.relative_to(root)}, line {number}, names {name}, which is not there" for name in missing]
-    return wrong
+    return list(walk(ast.parse(path.read_text(encoding="utf-8")), True))
 
 
 def test_no_module_needs_itself() -> None:
     """Not by way of others either, nor by an import inside a function."""
-    modules = modules_in(ROOT, PACKAGES)
-    needs = {name: {target for target, _, _ in imports_of(name, modules)} - {name} for name in modules}
+    needs = {name: {target for target, _, _ in imports_of(name)} - {name} for name in modules()}
     TopologicalSorter(needs).prepare()  # raises CycleError, which names the circle
 
 
 def test_imports_run_one_way_between_rooms() -> None:
-    assert wrong_arrows(modules_in(ROOT, PACKAGES), ROOMS, GROUND) == []
+    wrong = []
+    for name in modules():
+        own = room(name)
+        words = ROOMS.get("ground" if own in GROUND.split() else own, "").replace("ground", GROUND).split()
+        for target, line, at_once in imports_of(name):
+            allowed = {own, *(word if at_once else word.strip("()") for word in words)}
+            if room(target) not in allowed:
+                wrong.append(f"{name}, line {line}, imports {target}, but {own} may not import {room(target)}")
+    assert wrong == []
 
 
 def test_every_package_and_every_kernel_is_installed() -> None:
+    """What setup.cfg's `packages` and `package_data` say the tree has, and the other way round."""
     setup = configparser.ConfigParser(delimiters=("=",))
     setup.optionxform = str
     setup.read(ROOT / "setup.cfg")
-    assert unpackaged(ROOT, setup) == []
+    places = dict(re.split(r"\s*=\s*", line) for line in setup["options"]["package_dir"].split("\n") if line.strip())
+    listed = {name: ROOT / places.get(name, name.replace(".", "/")) for name in setup["options"]["packages"].split()}
+    tops = [ROOT / "d2_plugin", *(ROOT / place for place in places.values())]
+    assert {path.parent for top in tops for path in top.rglob("__init__.py")} == {*listed.values()}
+    covered = set()
+    for package, patterns in setup["options.package_data"].items():
+        for pattern in re.split(r"[,\s]+", patterns.strip()):
+            matches = set(listed[package].glob(pattern))
+            assert matches, f"package_data's {package} = {pattern} matches no file"
+            covered |= matches
+    every = {path for top in tops for path in top.rglob("*") if path.is_file() and path.suffix not in (".py", ".pyc")}
+    beside = {str(path.relative_to(ROOT)) for path in every - covered}
+    assert {path for path in beside if not re.search(r"(^|/)\.", path)} == set(), "in no package_data"
 
 
 def test_every_document_that_is_named_is_there() -> None:
@@ -164,4 +142,10 @@ def test_every_document_that_is_named_is_there() -> None:
         path for place in places for path in place.rglob("*") if path.suffix in (".md", ".py", ".h", ".cpp", ".cu")
     ]
     top = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "setup.cfg", ".ci/run")]
-    assert missing_documents(ROOT, [*top, *sorted(files)]) == []
+    missing = []
+    for path in [*top, *sorted(files)]:
+        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
+            names = DOCUMENT.findall(line) + (LINK.findall(line) if path.suffix == ".md" else [])
+            found = [name for name in names if (ROOT / name).exists() or (path.parent / name).exists()]
+            missing += [f"{path.relative_to(ROOT)}, line {number}: {name}" for name in names if name not in found]
+    assert missing == []

@@ -16,7 +16,7 @@ from typing import Any
 
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from d2_plugin import durable
@@ -45,6 +45,7 @@ JSON = st.recursive(
 )
 
 
+@settings(max_examples=25)  # each writes twice
 @given(st.dictionaries(st.text().filter(lambda name: name not in ("format", "seal")), JSON, max_size=5))
 def test_what_is_read_is_what_was_written(tmp_path_factory: pytest.TempPathFactory, values: dict[str, Any]) -> None:
     path = tmp_path_factory.mktemp("table") / "table.json"
@@ -150,21 +151,18 @@ def test_an_archive_opens_for_torch_and_zip_as_it_is(tmp_path: Path) -> None:
         assert opened.testzip() is None
 
 
-def test_every_flipped_bit_of_an_archive_is_seen_before_anybody_reads_it(tmp_path: Path) -> None:
+def test_a_flipped_bit_of_an_archive_is_seen_before_anybody_reads_it(tmp_path: Path) -> None:
     path = archive(tmp_path / "whole.pt", {"a": torch.arange(9.0), "b": "text"})
     whole = path.read_bytes()
     directory = whole.index(b"PK\x01\x02")  # zip's own checksums are not of what stands from here on
-    for place in [*range(0, 8 * directory, 997), *range(8 * directory, 8 * len(whole), 3)]:
+    for place in [*range(0, 8 * directory, 1997), *range(8 * directory, 8 * len(whole), 19)]:
         damaged = bytearray(whole)
         damaged[place // 8] ^= 1 << place % 8
         path.write_bytes(damaged)
         with pytest.raises(Damaged, match="differs from its checksum"), opened_archive(path, "archive", "make it anew"):
             pass
-
-
-def test_an_archive_that_another_program_wrote_is_not_opened(tmp_path: Path) -> None:
-    torch.save({}, tmp_path / "other.pt")
-    with pytest.raises(Damaged), opened_archive(tmp_path / "other.pt", "archive", "make it anew"):
+    torch.save({}, path)  # and so is one that another program wrote
+    with pytest.raises(Damaged), opened_archive(path, "archive", "make it anew"):
         pass
 
 

@@ -142,7 +142,6 @@ def test_whole_numbers_become_floats_and_lists_tuples() -> None:
     ("table", "sentence"),
     [
         ({"start": -1}, r"setting run\.start must be at least 0 steps, got -1"),
-        ({"share": 2}, r"setting run\.share must be at least 0 and at most 1, got 2"),
         ({"share": math.nan}, r"setting run\.share must be at least 0 and at most 1, got nan"),
         ({"weight": 0}, r"setting run\.weight must be above 0, got 0"),
         ({"weight": 10**400}, r"setting run\.weight must be a number below 1.8e308 in size, got 1000.* \.\.\.$"),
@@ -152,7 +151,6 @@ def test_whole_numbers_become_floats_and_lists_tuples() -> None:
         ({"kind": "metrc"}, r"unknown run\.kind 'metrc': have metric, relative; did you mean 'metric'\?"),
         ({"kind": 3}, r"setting run\.kind must be one of relative, metric, got 3"),
         ({"tau": [1]}, r"setting run\.tau must be one of auto or a number, got \[1\]"),
-        ({"tau": -1}, r"setting run\.tau must be above 0, got -1"),
         ({"tau": "aut"}, r"unknown run\.tau 'aut': have auto; did you mean 'auto'\?"),
         ({"levels": [1, 0]}, r"setting run\.levels\[1\] must be at least 1, got 0"),
         ({"bounds": [1]}, r"setting run\.bounds must be a list of 2 values, got \[1\]"),

