@@ -40,6 +40,13 @@ def test_a_real_row_becomes_the_opencv_camera_it_describes() -> None:
     assert camera.near_far == (8.5598926, 19.8132412)
 
 
+def test_a_row_that_is_not_finite_is_refused() -> None:
+    row = ROW.copy()
+    row[0] = np.nan
+    with pytest.raises(D2Error, match="cam00.*not finite"):
+        camera_from_row(row, "cam00", None, "poses_bounds.npy")
+
+
 @pytest.mark.parametrize(
     "pattern",
     [

@@ -84,3 +84,5 @@ def test_files_that_cannot_be_are_refused(tmp_path: Path) -> None:
     (path / "Birthday_00151_00.png").unlink()
     write_png(path / "Train_undist_00151_00.png", np.zeros((H, W, 3), np.uint8))
     refused(path, "several scenes .birthday, train.")
+    (path / "cameras_parameters.txt").write_text(HEADER)
+    refused(path, "describes no camera")

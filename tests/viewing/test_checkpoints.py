@@ -148,7 +148,11 @@ class TestDeformable3D:
         assert len(viewed_at(ViewSettings(tmp_path, recording=room)).backbone) == 40
         with pytest.raises(D2Error, match=r"point_cloud\.ply does not say where its cameras stood"):
             viewed_at(ViewSettings(tmp_path))
-        (tmp_path / "deform" / "iteration_40000" / "deform.pth").unlink()
+        weights = tmp_path / "deform" / "iteration_40000" / "deform.pth"
+        torch.save({"layer.weight": torch.zeros(3)}, weights)
+        with pytest.raises(D2Error, match=r"has no linear\.0\.weight: it is no network of Deformable-3D-Gaussians"):
+            open_viewed(tmp_path, room)
+        weights.unlink()
         with pytest.raises(D2Error, match="a point cloud of Deformable-3D-Gaussians moves by it, copy both"):
             open_viewed(tmp_path, room)
 
