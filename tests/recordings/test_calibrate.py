@@ -44,7 +44,7 @@ class TestRefinedPoses:
         centres = [np.mean([camera.centre for camera in rig.values()], axis=0) for rig in (refined.cameras, given)]
         np.testing.assert_allclose(*centres, atol=1e-9)  # the rig as a whole stays where it was
 
-    @pytest.mark.parametrize("degrees", [0.25, 0.5, 1.0, 2.0])
+    @pytest.mark.parametrize("degrees", [0.25, 2.0])
     def test_one_camera_that_is_turned_is_named_and_mended(self, degrees: float) -> None:
         truth = arc()
         given = {**truth, "c2": moved(truth, degrees, 0.0)["c2"]}
@@ -69,13 +69,6 @@ class TestRefinedPoses:
         assert refined.cameras == truth
         assert "the poses stay" in refined.reason
         assert not any(turn.wrong for turn in refined.turns.values())
-
-    def test_matches_that_are_all_wrong_change_nothing(self) -> None:
-        truth = arc(2)
-        given = moved(truth, 1.0, 0.01)
-        refined = refine_poses(given, seen_by(truth, things=80, wrong=1.0))
-        assert not refined.accepted
-        assert refined.cameras == given
 
     def test_a_camera_that_shares_nothing_is_named(self) -> None:
         truth = arc()

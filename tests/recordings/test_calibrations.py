@@ -67,9 +67,8 @@ def test_known_cameras_come_back(name: str, tmp_path: Path) -> None:
         cameras = in_first_camera(cameras)
     for camera, known in zip(found.cameras, cameras, strict=True):
         assert_same(camera, known, points)
-    if (
-        case.format not in ("easymocap", "colmap") and "stereo" not in name
-    ):  # the format is seen from the content, not the name
+    named = case.format in ("easymocap", "colmap") or "stereo" in name
+    if not named:  # the format is seen from the content
         assert open_calibration(written.rename(tmp_path / "rig.txt"), sizes).format == case.format
 
 
@@ -146,7 +145,6 @@ def file_with(name: str, content: bytes) -> Callable[[Path], Path]:
     return write
 
 
-MIRRORED = [camera._replace(R=camera.R @ np.diag([1.0, 1, -1])) for camera in rig()]
 SCALED_UP = [camera._replace(R=1.01 * camera.R) for camera in rig()]
 UNPLACED = b"[cameras.0]\ncam_id = 0\nsize = [4, 4]\nmatrix = [[4.0, 0, 2], [0, 4, 2], [0, 0, 1]]\n"
 NO_UNDISTORTION = "cam0 .* model {}, .*pinhole-equi or pinhole-radtan"
@@ -155,19 +153,11 @@ NO_UNDISTORTION = "cam0 .* model {}, .*pinhole-equi or pinhole-radtan"
 @pytest.mark.parametrize(
     ("write", "message"),
     [
-        (lambda path: cameras_json(path, MIRRORED), "cam_0 .* mirrored pose .* left-handed axes; export it"),
         (lambda path: cameras_json(path, SCALED_UP), r"cam_0 .* an R that is no rotation \(orthonormal"),
         (file_with("cam.pickle", b"\x80\x04\x95."), "is a pickle, which can run any program .* convert it to TOML"),
-        (
-            file_with("a.json", b'{"frames": 3}'),
-            "no calibration that can be read: expected one of folder, caliscope",
-        ),
+        (file_with("a.json", b'{"frames": 3}'), "no calibration that can be read: expected one of folder, caliscope"),
         (lambda path: path / "b.json", "no such calibration"),
         (file_with("a.yaml", b"a: &a [1]\ncam0: *a\n"), "has YAML aliases"),
-        (
-            file_with("b.yaml", b"cam0: " + b"[" * 200_000 + b"]" * 200_000),
-            "nested more than 64 deep|maximum nesting depth",
-        ),
         (file_with("a.toml", UNPLACED), "cam_0 .* has no rotation and no translation: Caliscope could not place it"),
         (kalibr_with("pinhole", "omni"), NO_UNDISTORTION.format("omni")),
         (kalibr_with("radtan", "fov"), NO_UNDISTORTION.format("fov")),
@@ -211,36 +201,26 @@ class TestDamaged:
         with pytest.raises(D2Error, match="every image needs the name of its file"):
             arrange([name], lambda group: True)
 
-    def test_a_model_of_a_thousand_letters_is_told_in_a_few(self, tmp_path: Path) -> None:
-        (tmp_path / "cameras.txt").write_text(f"1 {'P' * 9000} 64 48 50 50 32 24\n")
-        (tmp_path / "images.txt").write_text("1 1 0 0 0 0 0 0 1 cam0/0.png\n\n")
-        with pytest.raises(D2Error) as refusal:
-            cameras_of(tmp_path)
-        assert len(str(refusal.value)) < 1000
-
 
 class TestNames:
     """Recordings find their cameras; a way that fits only some is not taken."""
 
     @pytest.mark.parametrize(
-        ("cameras", "recordings"),
+        ("expected", "recordings"),
         [
-            (("cam_0", "cam_1", "cam_2"), ("cam_2", "cam_0", "cam_1")),
-            (("00_05", "00_06", "00_07"), ("hd_00_07", "hd_00_05", "hd_00_06")),
-            (("int_cam1_img", "int_cam2_img", "int_cam10_img"), ("cam10", "cam01", "cam02")),
-            (("left", "right", "top"), ("GOPRO-Right", "GOPRO-Left", "GOPRO-Top")),
+            (("cam_2", "cam_0", "cam_1"), ("cam_2", "cam_0", "cam_1")),
+            (("00_07", "00_05", "00_06"), ("hd_00_07", "hd_00_05", "hd_00_06")),
+            (("int_cam10_img", "int_cam1_img", "int_cam2_img"), ("cam10", "cam01", "cam02")),
+            (("right", "left", "top"), ("GOPRO-Right", "GOPRO-Left", "GOPRO-Top")),
         ],
     )
-    def test_by_name(self, cameras: tuple[str, ...], recordings: tuple[str, ...], tmp_path: Path) -> None:
+    def test_by_name(self, expected: tuple[str, ...], recordings: tuple[str, ...], tmp_path: Path) -> None:
+        cameras = sorted(expected)
         path = panoptic(tmp_path, [camera._replace(size=(1280, 720)) for camera in rig(names=cameras)])
         found = open_calibration(path, dict.fromkeys(recordings, (1280, 720)))
         assert [camera.name for camera in found.cameras] == list(recordings)
-        by_focal = {round(camera.lens.K[0, 0]) - 900: camera.name for camera in found.cameras}
-        fit = {0: cameras[0], 1: cameras[1], 2: cameras[2]}
-        for number, recording in by_focal.items():
-            one, other = fit[number].lower(), recording.lower()
-            digits = [int("".join(filter(str.isdigit, name)) or -1) for name in (one, other)]
-            assert one in other or digits[0] == digits[1]
+        of_file = {camera.name: cameras[round(camera.lens.K[0, 0]) - 900] for camera in found.cameras}
+        assert of_file == dict(zip(recordings, expected, strict=True))
         assert not found.notes
 
     def test_by_order_with_a_note(self, tmp_path: Path) -> None:

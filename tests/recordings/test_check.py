@@ -21,7 +21,7 @@ from d2_plugin.recordings.checks import memory as memory_module
 from d2_plugin.recordings.checks.exposure import relative_exposures
 from d2_plugin.recordings.checks.memory import available_bytes, check_memory, needed_bytes
 from d2_plugin.recordings.synthetic.room import synthetic_recording
-from d2_plugin.runs.plan import appearance_decision, plan_scene
+from d2_plugin.runs.plan import appearance_decision
 
 pytest.importorskip("cv2", reason="opencv is in the `image` extra")
 
@@ -39,32 +39,23 @@ def moved(recording: Recording, name: str, **changes: object) -> Recording:
     return replace(recording, cameras={**recording.cameras, name: replace(recording.cameras[name], **changes)})
 
 
-def transposed(recording: Recording, name: str) -> Recording:
-    T = recording.cameras[name].T_camera_world.copy()
-    T[:3, :3] = T[:3, :3].T
-    return moved(recording, name, T_camera_world=T)
-
-
 def notes_of(recording: Recording) -> tuple[str, ...]:
     return check_recording(recording, list(recording.cameras), list(recording.cameras))
 
 
-def test_a_good_recording_has_nothing_to_be_noted(room: Recording) -> None:
-    assert notes_of(room) == ()
-
-
-@pytest.mark.parametrize("name", ["n3dv_sear_steak_t0", "pose2sim_single", "plaza", "studio"])
+@pytest.mark.parametrize("name", ["n3dv_sear_steak_t0", "pose2sim_single", "plaza"])
 def test_real_and_rendered_recordings_have_nothing_to_be_noted(name: str, shared_data: Callable[[str], Path]) -> None:
     recording = open_recording(shared_data(name))
     assert notes_of(select_cameras(recording, list(recording.cameras)[:4])) == ()
 
 
-@pytest.mark.parametrize("bad", ["cam00", "cam05"])
-def test_a_transposed_rotation_of_a_real_camera_is_named(bad: str, shared_data: Callable[[str], Path]) -> None:
+def test_a_transposed_rotation_of_a_real_camera_is_named(shared_data: Callable[[str], Path]) -> None:
     recording = open_recording(shared_data("n3dv_sear_steak_t0"), downscale=2)
-    (note,) = notes_of(transposed(recording, bad))
+    T = recording.cameras["cam05"].T_camera_world.copy()
+    T[:3, :3] = T[:3, :3].T
+    (note,) = notes_of(moved(recording, "cam05", T_camera_world=T))
     assert "the calibration misses features that two images share" in note
-    assert note.endswith(f"check R, t and K of camera {bad}")
+    assert note.endswith("check R, t and K of camera cam05")
 
 
 def test_a_wrong_focal_length_is_named(room: Recording) -> None:
@@ -75,26 +66,18 @@ def test_a_wrong_focal_length_is_named(room: Recording) -> None:
 
 
 def test_one_bad_pair_does_not_overrule_all_others() -> None:
-    def said(*missed: str) -> tuple[bool, str]:
-        pairs = [(a, b) for a, b in combinations("abcd", 2)]
-        checked = [check._Pair(a, b, 151.0 if a + b in missed else 1.0, a + b in missed, 40) for a, b in pairs]
-        return check._suspects(checked), check._missed(checked)
-
-    suspects, why = said("ad")
-    assert suspects == ""
-    assert "features of a and d by 151 pixels, but not those of their other pairs" in why
-    suspects, why = said("ad", "bd", "cd")
-    assert suspects == "camera d"
-    assert why.endswith("check R, t and K of camera d")
+    distances = {(a, b): 151.0 if a + b == "ad" else 1.0 for a, b in combinations("abcd", 2)}
+    checked = [check._Pair(*pair, distance, distance > 1, 40) for pair, distance in distances.items()]
+    assert check._suspects(checked) == ""
+    assert "features of a and d by 151 pixels, but not those of their other pairs" in check._missed(checked)
 
 
-@pytest.mark.parametrize("names", [("03", "07", "12", "15"), ("02", "03", "05", "07", "12", "15", "18", "22")])
-def test_a_right_calibration_of_a_real_dome_is_not_called_wrong(names: tuple, shared_data: Callable) -> None:
-    recording = open_recording(shared_data("dome"), cameras=names)
+def test_a_right_calibration_of_a_real_dome_is_not_called_wrong(shared_data: Callable) -> None:
+    recording = open_recording(shared_data("dome"), cameras=("02", "03", "05", "07", "12", "15", "18", "22"))
     assert check.calibration_contradicted(recording) == (False, "")
 
 
-@pytest.mark.parametrize(("bad", "degrees"), [("03", 4), ("07", 3), ("12", 3), ("15", 3), ("22", 3)])
+@pytest.mark.parametrize(("bad", "degrees"), [("03", 4), ("12", 3)])
 def test_the_turned_camera_of_a_real_dome_is_named(bad: str, degrees: float, shared_data: Callable) -> None:
     recording = open_recording(shared_data("dome"))
     turned = rotated(recording.cameras[bad], np.deg2rad(degrees) * np.array([0.5, 0.5, 0.7]))
@@ -187,9 +170,8 @@ def exposed(recording: Recording, gains: dict[str, tuple[float, float, float]]) 
         bright = recording.image(camera, frame) * np.array(gains.get(camera, (1, 1, 1)))
         return np.clip(np.rint(bright), 0, 255).astype(np.uint8)
 
-    return SimpleNamespace(
-        **{name: getattr(recording, name) for name in ("cameras", "frames", "seconds", "exposures")}, image=image
-    )
+    kept = {name: getattr(recording, name) for name in ("cameras", "frames", "seconds", "exposures")}
+    return SimpleNamespace(**kept, image=image)
 
 
 def test_cameras_of_equal_exposure_agree(wide_room: tuple) -> None:
@@ -219,13 +201,3 @@ def test_too_few_points_or_one_camera_decide_nothing(wide_room: tuple) -> None:
     assert relative_exposures(recording, CAMERAS, points[:0], times[:0]) is None
     assert not appearance_decision(recording, CAMERAS, points[:5], times[:5]).use
     assert appearance_decision(recording, CAMERAS[:1], points, times).impossible
-
-
-def test_the_user_has_the_last_word(wide_room: tuple) -> None:
-    recording, points, times = wide_room
-    plan = plan_scene(recording, list(CAMERAS), None).with_decision(
-        appearance_decision(recording, CAMERAS, points, times)
-    )
-    assert not plan.uses("appearance")
-    assert plan.override(appearance=True).uses("appearance")
-    assert len(plan.with_decision(plan.measured[-1]).measured) == len(plan.measured)

@@ -96,13 +96,6 @@ def test_models_are_opencvs(model: str, distortion: tuple[float, ...]) -> None:
     np.testing.assert_allclose(lens.recorded_pixels(rays * K[[0, 1], [0, 1]] + K[:2, 2]), expected[:, 0], atol=1e-9)
 
 
-def test_a_lens_without_distortion_changes_no_position() -> None:
-    lens = Lens(K, "opencv", (0.0, 0.0))
-    assert not lens.bends
-    np.testing.assert_allclose(lens.recorded_pixels(centres()), centres(), atol=1e-12)
-    assert Lens(K, "fisheye").bends  # an ideal fisheye is no pinhole
-
-
 @settings(max_examples=40, deadline=None)
 @given(st.floats(-0.8, -0.05), st.floats(0.0, 0.2))
 def test_rays_beyond_the_fold_of_the_polynomial_have_no_image(k1: float, k2: float) -> None:
@@ -121,7 +114,6 @@ def test_the_share_of_black_pixels_is_measured() -> None:
     x, y = np.moveaxis(Lens(K, "opencv", (0.4,)).recorded_pixels(centres()), -1, 0)
     exact = 1 - ((x >= 0) & (x <= SIZE[0]) & (y >= 0) & (y <= SIZE[1])).mean()
     assert wide == pytest.approx(exact, abs=0.05)
-    assert wide > 0.1
 
 
 def test_a_lens_that_leaves_hardly_anything_of_a_image_is_refused(tmp_path: Path) -> None:
@@ -133,25 +125,12 @@ def test_a_lens_that_leaves_hardly_anything_of_a_image_is_refused(tmp_path: Path
         open_recording(path)
 
 
-def test_pixels_outside_the_recorded_image_are_black() -> None:
-    pytest.importorskip("cv2")
-    lens = Lens(K, "opencv", (0.4,))
-    bright = Recorded(lens)
-    bright.image = lambda camera, frame: np.full((SIZE[1], SIZE[0], 3), 200, np.uint8)
-    image = UndistortedSource(bright, {"a": of(lens)}).image("a", 0)
-    assert (image[0, 0] == 0).all()
-    assert (image[32, 48] == 200).all()
-    np.testing.assert_array_equal(UndistortedSource(bright, {}).image("a", 0), 200)
-
-
 def test_a_source_travels_to_another_process() -> None:
     pytest.importorskip("cv2")
     lens = LENSES["barrel"]
     source = UndistortedSource(Recorded(lens), {"a": of(lens)})
-    before = source.image("a", 0)
     again = pickle.loads(pickle.dumps(source))
-    assert not again._kept
-    np.testing.assert_array_equal(again.image("a", 0), before)
+    np.testing.assert_array_equal(again.image("a", 0), source.image("a", 0))
 
 
 def test_a_rational_lens_ends_before_it_folds_or_has_a_pole() -> None:

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from small_layouts import small_recording, write_layout
+from small_layouts import small_recording
 
 from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.photometric import photometric_loss, weighted_photometric_loss
-from d2_plugin.priors import construct
-from d2_plugin.priors.frame import Frame, view_digest
+from d2_plugin.priors.construct import _within
+from d2_plugin.priors.fuse import fuse
 from d2_plugin.protocol import Label
 from d2_plugin.recordings import open_recording
 from d2_plugin.recordings.cameras.camera import CalibratedCamera
@@ -63,34 +63,17 @@ def test_masks_are_read_where_they_lie(folder: str, tmp_path: Path) -> None:
     assert any(note == f"foreground masks of cam00 from {folder}" for note in recording.notes)
 
 
-def test_enerf_recordings_have_theirs_in_bgmtv2(tmp_path: Path) -> None:
-    path = write_layout("enerf", tmp_path / "recording")
-    write_mask(path / "bgmtv2" / "cam00" / "000001.png", left_half(128))
-    recording = open_recording(path)
-    mask = recording.mask("cam00", recording.frames[1])
-    assert mask is not None
-    assert mask[5, 10] == pytest.approx(128 / 255, abs=0.01)
-
-
-@pytest.mark.parametrize("channels", [1, 3, 4])
+@pytest.mark.parametrize("channels", [3, 4])
 def test_a_mask_may_have_any_number_of_channels(channels: int, tmp_path: Path) -> None:
     path = recorded_folder(tmp_path / "recording")
     grey = left_half()
-    if channels == 3:
-        write_mask(path / "masks" / "cam00" / "0000.png", np.repeat(grey[..., None], 3, axis=2))
+    colors = np.repeat(grey[..., None], 3, axis=2)
     if channels == 4:  # colours of a cut-out person, whose opacity is the mask
-        write_mask(path / "masks" / "cam00" / "0000.png", np.dstack([np.full((H, W, 3), 90, np.uint8), grey]))
+        colors = np.dstack([np.full((H, W, 3), 90, np.uint8), grey])
+    write_mask(path / "masks" / "cam00" / "0000.png", colors)
     mask = open_recording(path).mask("cam00", 0)
     assert mask is not None
     np.testing.assert_array_equal(mask, grey / 255)
-
-
-def test_a_recording_without_masks_has_none(tmp_path: Path) -> None:
-    recording = open_recording(save_recording(small_recording(), tmp_path / "recording"))
-    assert recording.mask("cam00", 0) is None
-    assert recording.recorded("cam00") is None
-    assert TrainingFrames(recording, CAMERAS, background_weight=0.0).weights(0) is None
-    assert view_digest(recording, "cam00", 0) == Frame.read(recording, CAMERAS, 0).hashes["cam00"]
 
 
 def test_a_mask_of_another_size_is_refused(tmp_path: Path) -> None:
@@ -127,15 +110,7 @@ class TestUndistortion:
         assert 0.5 < undone.valid.mean() < 0.95
         assert (white[~undone.valid].min(axis=-1) < 255).mean() > 0.5  # not much smaller than it has to be
 
-    def test_a_pinhole_leaves_images_alone(self) -> None:
-        undone = Undistortion(replace(self.CAMERA, lens=Lens(self.LENS.K)))
-        image = np.zeros((H, W, 3), np.uint8)
-        assert undone.image(image) is image
-        assert undone.valid is None
-
     def test_opening_a_distorted_recording_says_the_same(self, tmp_path: Path) -> None:
-        import json
-
         path = recorded_folder(tmp_path / "recording")
         content = json.loads((path / "cameras.json").read_text())
         content["cameras"][0] |= {"model": "opencv", "distortion": [0.3, 0, 0, 0]}
@@ -144,10 +119,8 @@ class TestUndistortion:
         recorded, mask = recording.recorded("cam00"), recording.mask("cam00", 0)
         assert recorded is not None
         assert mask is not None
-        assert (recording.image("cam00", 0)[~recorded].mean(), recording.recorded("cam01")) == (
-            pytest.approx(0, abs=40),
-            None,
-        )
+        assert recording.image("cam00", 0)[~recorded].mean() < 40
+        assert recording.recorded("cam01") is None
         assert not np.array_equal(mask, left_half() / 255)  # it was bent with the image
         assert mask[H // 2, W // 2 - 3] == 1
 
@@ -181,13 +154,6 @@ class TestLoss:
         assert gradients[0][:, 18:].abs().max() == 0  # beyond the reach of a window
         assert gradients[0][:, :12].abs().min() > 0
 
-    def test_l1_is_weighted_pixel_by_pixel(self) -> None:
-        image, target = self.images()
-        weights = torch.rand(24, 20, generator=torch.Generator().manual_seed(1))
-        image.requires_grad_()
-        (gradient,) = torch.autograd.grad(photometric_loss(image, target, 0.0, weights), image)
-        torch.testing.assert_close(gradient.abs(), (weights / (24 * 20 * 3))[..., None].expand_as(gradient))
-
     def test_gradients_are_right(self) -> None:
         generator = torch.Generator().manual_seed(0)
         image, target = (torch.rand(7, 6, 3, generator=generator, dtype=torch.float64) for _ in range(2))
@@ -220,9 +186,8 @@ def test_the_score_inside_the_mask(tmp_path: Path) -> None:
         drawn[:, : W // 2] = (drawn[:, : W // 2] + 0.1).clamp(0, 1)
         return drawn, None
 
-    rows = {
-        (row["camera"], row["frame"]): row for row in evaluate(render, recording, CAMERAS, recording.frames)["per_view"]
-    }
+    found = evaluate(render, recording, CAMERAS, recording.frames)["per_view"]
+    rows = {(row["camera"], row["frame"]): row for row in found}
     error = ((truth[:, : W // 2] + 0.1).clamp(0, 1) - truth[:, : W // 2]).square().mean()
     assert rows["cam00", 0]["psnr_mask"] == pytest.approx(-10 * torch.log10(error).item(), abs=1e-3)
     assert rows["cam00", 1]["psnr_mask"] is None
@@ -230,13 +195,11 @@ def test_the_score_inside_the_mask(tmp_path: Path) -> None:
 
 
 def test_a_prior_knows_nothing_of_what_was_not_recorded() -> None:
-    from d2_plugin.priors.fuse import fuse
-
     full = np.full((H, W), 2.0, np.float32)
     maps = fuse(full, full, tau_c=0.1)
     assert (maps.labels == Label.VERIFIED).all()
     recorded = left_half() > 0
-    kept = construct._within(maps, recorded)
+    kept = _within(maps, recorded)
     assert (kept.labels[recorded] == Label.VERIFIED).all()
     assert (kept.labels[~recorded] == Label.EMPTY).all()
     assert (kept.depth[~recorded] == 0).all()

@@ -14,6 +14,7 @@ from stand_in_recordings import refused
 from d2_plugin.errors import D2Error
 from d2_plugin.recordings import open_recording
 from d2_plugin.recordings.export.folder import save_recording
+from d2_plugin.recordings.images import write_png
 from d2_plugin.recordings.recording import Recording
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 
@@ -41,7 +42,9 @@ def edit_calibration(folder: Path, camera: int | None, **changes: object) -> Non
     path.write_text(json.dumps(content))
 
 
-def test_a_saved_recording_reads_back_bitwise(original: Recording, saved: Path) -> None:
+def test_a_saved_recording_reads_back_bitwise_and_is_not_written_over(original: Recording, saved: Path) -> None:
+    with pytest.raises(D2Error, match="not empty.*nothing was written"):
+        save_recording(original, saved)
     found = open_recording(saved)
     assert (found.name, found.frames, found.fps) == ("scene", original.frames, original.fps)
     assert found.mono_kind == "relative"
@@ -58,11 +61,6 @@ def test_a_saved_recording_reads_back_bitwise(original: Recording, saved: Path) 
             np.testing.assert_array_equal(found.mono(name, frame), original.mono(name, frame))
 
 
-def test_saving_overwrites_nothing(original: Recording, saved: Path) -> None:
-    with pytest.raises(D2Error, match="not empty.*nothing was written"):
-        save_recording(original, saved)
-
-
 def test_opening_reads_headers_only(folder: Path) -> None:
     for image in (folder / "images").rglob("*.png"):
         image.write_bytes(image.read_bytes()[:40])
@@ -71,35 +69,30 @@ def test_opening_reads_headers_only(folder: Path) -> None:
         recording.image("train0", 0)
 
 
-def test_maps_are_optional(folder: Path) -> None:
-    shutil.rmtree(folder / "depth")
-    shutil.rmtree(folder / "mono")
-    recording = open_recording(folder)
-    assert recording.mono_kind is None
-    assert not recording.mono_emulated
-    assert recording.depth("train0", 0) is None
-    assert recording.mono("train0", 0) is None
-
-
-def test_metric_maps_are_declared_in_mono_json(folder: Path) -> None:
+def test_maps_are_declared_in_mono_json_and_optional(folder: Path) -> None:
     (folder / "mono" / "mono.json").write_text('{"kind": "metric"}')
     recording = open_recording(folder)
     assert recording.mono_kind == "metric"
     assert not recording.mono_emulated
     (folder / "mono" / "mono.json").write_text('{"kind": "disparity"}')
     refused(folder, r"mono\.json says kind 'disparity'.*expected 'relative' or 'metric'")
+    shutil.rmtree(folder / "depth")
+    shutil.rmtree(folder / "mono")
+    recording = open_recording(folder)
+    assert recording.mono_kind is None
+    assert recording.depth("train0", 0) is None
+    assert recording.mono("train0", 0) is None
 
 
-def test_depth_that_is_not_finite_counts_as_unknown(folder: Path, original: Recording) -> None:
+def test_depth_that_is_not_finite_counts_as_unknown_and_monocular_maps_keep_their_holes(
+    folder: Path, original: Recording
+) -> None:
     depth = original.depth("train0", 0).copy()
     depth[0, :3] = np.nan, np.inf, -1
     np.savez(folder / "depth" / "train0" / "00000.npz", depth=depth)
     read = open_recording(folder).depth("train0", 0)
     np.testing.assert_array_equal(read[0, :3], 0)
     np.testing.assert_array_equal(read[1:], depth[1:])
-
-
-def test_monocular_maps_keep_their_holes(folder: Path) -> None:
     np.save(folder / "mono" / "train0" / "00000.npy", np.full((5, 7), np.nan, np.float16))
     mono = open_recording(folder).mono("train0", 0)
     assert mono.shape == (5, 7)
@@ -146,11 +139,7 @@ def test_images_that_fit_no_camera_or_frame_are_refused(folder: Path) -> None:
 
 
 def test_images_of_two_sizes_are_refused_when_read(folder: Path) -> None:
-    small = synthetic_recording(cameras=2, frames=2, width=16, height=12)
-    shutil.rmtree(folder / "images" / "train0")
-    other = save_recording(small, folder.parent / "small")
-    shutil.copytree(other / "images" / "train0", folder / "images" / "train0")
-    shutil.copy(folder / "images" / "train1" / "00000.png", folder / "images" / "train0" / "00000.png")
+    write_png(folder / "images" / "train0" / "00001.png", np.zeros((12, 16, 3), np.uint8))
     recording = open_recording(folder)
     with pytest.raises(D2Error, match="frame 1 of camera train0 is 16x12 pixels but its calibration says 32x24"):
         recording.image("train0", 1)
@@ -160,10 +149,8 @@ def test_images_of_two_sizes_are_refused_when_read(folder: Path) -> None:
     ("changes", "message"),
     [
         ({"fx": float("nan")}, "cameras.json is not JSON .*NaN, which is not finite"),
-        ({"t": [0, float("inf"), 0]}, "cameras.json is not JSON .*Infinity, which is not finite"),
         ({"fy": -3.0}, "focal lengths"),
         ({"R": [[1, 0, 0], [0, 1, 0], [0, 0, -1]]}, "no rotation"),
-        ({"R": [[2, 0, 0], [0, 1, 0], [0, 0, 1]]}, "no rotation"),
         ({"R": [[1, 0], [0, 1]]}, "cannot be understood"),
         ({"width": 0}, "at least one pixel"),
         ({"name": "train1"}, "camera train1 twice"),
@@ -180,22 +167,7 @@ def test_broken_descriptions_are_refused(folder: Path) -> None:
     edit_calibration(folder, None, bounds={}, fps=0)
     refused(folder, "fps 0, expected frames per second above 0")
     path = folder / "cameras.json"
-    content = json.loads(path.read_text())
-    del content["cameras"][0]["cx"]
-    path.write_text(json.dumps(content))
+    path.write_text(path.read_text().replace('"cx"', '"x"', 1))
     refused(folder, "camera train0 .* has no cx")
-    path.write_text('{"cameras": []}')
-    refused(folder, "no list 'cameras'")
     path.write_text("{")
     refused(folder, re.escape(str(path)) + " is not JSON")
-
-
-def test_broken_maps_are_refused_by_name(folder: Path) -> None:
-    archive = folder / "depth" / "train0" / "00000.npz"
-    archive.write_bytes(archive.read_bytes()[:-100])
-    np.save(folder / "mono" / "train0" / "00000.npy", np.zeros((2, 3, 4)))
-    recording = open_recording(folder)
-    with pytest.raises(D2Error, match=r"cannot read .*00000\.npz"):
-        recording.depth("train0", 0)
-    with pytest.raises(D2Error, match=r"has shape \(2, 3, 4\), expected \[height, width\]"):
-        recording.mono("train0", 0)

@@ -24,12 +24,6 @@ ROW = np.array(
 """The real row of camera cam00 of sear_steak."""
 
 
-@pytest.fixture(scope="module")
-def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A video of 20 frames."""
-    return write_videos(smooth_recording(("00",)), tmp_path_factory.mktemp("videos")) / "cam00.mp4"
-
-
 def test_a_real_row_becomes_the_opencv_camera_it_describes() -> None:
     camera = camera_from_row(ROW, "cam00", (1352, 1014), "poses_bounds.npy").pinhole("poses_bounds.npy")
     rotation = [
@@ -46,21 +40,11 @@ def test_a_real_row_becomes_the_opencv_camera_it_describes() -> None:
     assert camera.near_far == (8.5598926, 19.8132412)
 
 
-@pytest.mark.parametrize(
-    ("place", "value", "message"),
-    [
-        (0, np.nan, "not finite"),
-        (4, 0.0, "below one pixel"),
-        (14, -5.0, "focal"),
-        (0, 1.0, "no rotation"),
-        (16, 1.0, "bounds"),
-    ],
-)
-def test_rows_that_cannot_be_are_refused(place: int, value: float, message: str) -> None:
+def test_a_row_that_is_not_finite_is_refused() -> None:
     row = ROW.copy()
-    row[place] = value
-    with pytest.raises(D2Error, match=f"cam00.*{message}"):
-        camera_from_row(row, "cam00", None, "poses_bounds.npy").pinhole("poses_bounds.npy")
+    row[0] = np.nan
+    with pytest.raises(D2Error, match="cam00.*not finite"):
+        camera_from_row(row, "cam00", None, "poses_bounds.npy")
 
 
 @pytest.mark.parametrize(
@@ -124,21 +108,13 @@ def test_of_the_whole_rig_a_few_cameras_are_enough_when_asked(tmp_path: Path) ->
         {"cam00": 0, "cam13": 13, "cam20": 20}, abs=1e-6
     )
     assert any("18 of 21 cameras are not there" in note for note in recording.notes)
-
-
-def test_rows_that_no_camera_can_be_told_for_are_refused_even_when_asked(tmp_path: Path) -> None:
-    path = n3dv_scene(tmp_path / "scene", 18, (0, 13, 17))  # a scene that lacks cameras: row 13 may be cam15's
+    lacking = n3dv_scene(tmp_path / "lacking", 18, (0, 13, 17))  # a scene without some: row 13 may be cam15's
     with pytest.raises(D2Error, match="18 rows for 3 cameras"):
-        open_recording(path, intersect=True)
+        open_recording(lacking, intersect=True)
 
 
 def test_the_unsynchronised_camera_of_coffee_martini_is_named(tmp_path: Path) -> None:
-    scene = tmp_path / "coffee_martini"
-    for name in ("cam00", "cam13"):
-        (scene / name).mkdir(parents=True)
-        write_png(scene / name / "0000.png", np.zeros((6, 8, 3), np.uint8))
-    np.save(scene / "poses_bounds.npy", np.stack([ROW, ROW]))
-    assert any("cam13" in note for note in open_recording(scene).notes)
+    assert any("cam13" in note for note in open_recording(n3dv_scene(tmp_path / "coffee_martini", 2, (0, 13))).notes)
 
 
 def test_a_recording_has_the_same_cameras_in_both_layouts(tmp_path: Path) -> None:
@@ -151,27 +127,20 @@ def test_a_recording_has_the_same_cameras_in_both_layouts(tmp_path: Path) -> Non
         np.testing.assert_allclose(theirs.K, ours.K, atol=1e-9)
         np.testing.assert_allclose(theirs.T_camera_world, ours.T_camera_world, atol=1e-6)
         assert theirs.near_far is not None
-    for frame in (0, 7, 19):  # the images differ by the video's compression only
-        difference = folder.image("05", frame).astype(float) - videos.image("cam05", frame)
-        assert np.abs(difference).mean() < 3
-        others = [
-            np.abs(folder.image("05", f).astype(float) - videos.image("cam05", frame)).mean() for f in folder.frames
-        ]
-        assert int(np.argmin(others)) == frame
+    shown = videos.image("cam05", 7).astype(float)
+    off = [np.abs(folder.image("05", frame) - shown).mean() for frame in folder.frames]
+    assert off[7] < 3, "the images differ by the video's compression only"
+    assert int(np.argmin(off)) == 7
 
 
-def test_a_video_source_travels_to_another_process(video: Path) -> None:
+def test_a_video_source_travels_to_another_process_and_ends_where_its_video_does(tmp_path: Path) -> None:
+    video = write_videos(smooth_recording(("00",), frames=6), tmp_path) / "cam00.mp4"
     source = VideoFrames({"a": read_video(video)})
     first = source.image("a", 4)
     again = pickle.loads(pickle.dumps(source))
     np.testing.assert_array_equal(again.image("a", 4), first)
-
-
-def test_a_frame_behind_the_end_of_a_video_is_refused(video: Path) -> None:
-    source = VideoFrames({"a": read_video(video)})
     with pytest.raises(D2Error, match=r"frame 400 of .*cam00\.mp4 cannot be decoded"):
         source.image("a", 400)
-    assert source.image("a", 2).shape == (64, 96, 3)
 
 
 def test_checked_points_of_sear_steak_project_where_every_camera_sees_them(shared_data, tmp_path: Path) -> None:

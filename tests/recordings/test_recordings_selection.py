@@ -21,16 +21,12 @@ from d2_plugin.recordings.synthetic.room import synthetic_recording
 cv2 = pytest.importorskip("cv2")
 
 
-@settings(max_examples=25, deadline=None)
-@given(st.integers(1, 40), st.integers(1, 40), st.integers(0, 2**31))
-def test_a_written_png_reads_back_bitwise(
-    tmp_path_factory: pytest.TempPathFactory, height: int, width: int, seed: int
-) -> None:
-    image = np.random.default_rng(seed).integers(0, 256, (height, width, 3), dtype=np.uint8)
-    path = tmp_path_factory.getbasetemp() / "image.png"
-    write_png(path, image)
-    assert image_size(path) == (width, height)
-    np.testing.assert_array_equal(read_image(path), image)
+@pytest.mark.parametrize(("width", "height"), [(1, 1), (1, 40), (37, 1), (23, 31)])
+def test_a_written_png_reads_back_bitwise(tmp_path: Path, width: int, height: int) -> None:
+    image = np.random.default_rng(0).integers(0, 256, (height, width, 3), dtype=np.uint8)
+    write_png(tmp_path / "image.png", image)
+    assert image_size(tmp_path / "image.png") == (width, height)
+    np.testing.assert_array_equal(read_image(tmp_path / "image.png"), image)
 
 
 @pytest.mark.parametrize("options", [[], [cv2.IMWRITE_JPEG_PROGRESSIVE, 1], [cv2.IMWRITE_JPEG_RST_INTERVAL, 4]])
@@ -44,9 +40,7 @@ def test_the_size_of_a_jpeg_is_read_from_its_header(tmp_path: Path, options: lis
     assert image_size(path) == (34, 21)
 
 
-@pytest.mark.parametrize(
-    "content", [b"", b"\xff\xd8", b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n", b"GIF89a", b"\xff\xd8\xff\xe0\x00\x00"]
-)
+@pytest.mark.parametrize("content", [b"", b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff\xe0\x00\x00"])
 def test_damaged_headers_are_refused(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "broken.png"
     path.write_bytes(content)
@@ -54,30 +48,22 @@ def test_damaged_headers_are_refused(tmp_path: Path, content: bytes) -> None:
         image_size(path)
 
 
-def test_a_missing_image_is_told(tmp_path: Path) -> None:
-    with pytest.raises(D2Error, match=r"cannot read .*none\.png"):
-        read_image(tmp_path / "none.png")
-
-
 def test_a_image_rotated_by_its_metadata_keeps_the_stored_pixel_order(tmp_path: Path) -> None:
     path = tmp_path / "rotated.jpg"
     cv2.imwrite(str(path), np.zeros((20, 30, 3), np.uint8))
     data = path.read_bytes()
-    tiff = (
-        b"II*\x00\x08\x00\x00\x00" + struct.pack("<HHHII", 1, 0x0112, 3, 1, 6) + bytes(4)
-    )  # orientation 6: by 90 degrees
+    orientation = struct.pack("<HHHII", 1, 0x0112, 3, 1, 6)  # by 90 degrees
+    tiff = b"II*\x00\x08\x00\x00\x00" + orientation + bytes(4)
     body = b"Exif\x00\x00" + tiff
     path.write_bytes(data[:2] + b"\xff\xe1" + struct.pack(">H", len(body) + 2) + body + data[2:])
     assert read_image(path).shape == (20, 30, 3)
 
 
 def test_only_images_need_opencv(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    recording = synthetic_recording(cameras=1, frames=1, width=16, height=16)
-    save_recording(recording, tmp_path / "scene")
+    path = save_recording(synthetic_recording(cameras=1, frames=1, width=16, height=16), tmp_path / "scene")
     monkeypatch.setitem(sys.modules, "cv2", None)
-    opened = open_recording(tmp_path / "scene")
     with pytest.raises(MissingExtra, match=r"reading images needs OpenCV.*d2-4dgs\[image\]"):
-        opened.image("train0", 0)
+        open_recording(path).image("train0", 0)
 
 
 @settings(max_examples=20, deadline=None)
@@ -94,7 +80,6 @@ def test_downscaling_a_image_is_opencvs_area_mean(factor: int, height: int, widt
 def test_downscaled_depth_averages_one_surface_and_ignores_unknown_pixels() -> None:
     depth = np.array([[2.0, 2.02, 0, 0], [2.02, 2.04, 0, 3.0]], np.float32)
     np.testing.assert_allclose(shrink_depth(depth, 2), [[2.02, 3.0]], rtol=1e-6)
-    np.testing.assert_array_equal(shrink_depth(np.zeros((4, 4), np.float32), 2), 0)
 
 
 @settings(max_examples=30, deadline=None)
@@ -125,12 +110,8 @@ def test_a_downscaled_recording_projects_points_to_the_same_place() -> None:
     assert small.mono("train0", 0).shape == (38, 50)
     np.testing.assert_array_equal(small.image("train0", 0), shrink_image(recording.image("train0", 0), 4))
     assert downscale(recording, 1) is recording
-
-
-@pytest.mark.parametrize("factor", [0, -2, 1.5, True, "2"])
-def test_downscaling_wants_a_whole_number(factor: object) -> None:
     with pytest.raises(D2Error, match="no whole number of at least 1"):
-        downscale(synthetic_recording(frames=1), factor)  # type: ignore[arg-type]
+        downscale(recording, 0)
 
 
 def test_selections_are_checked() -> None:

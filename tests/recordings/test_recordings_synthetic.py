@@ -9,7 +9,7 @@ from benchmarks.priors_motion import scene_flow
 from d2_plugin.errors import D2Error
 from d2_plugin.recordings.recording import Camera, Recording
 from d2_plugin.recordings.synthetic.raycast import render_depth
-from d2_plugin.recordings.synthetic.room import furnished_room, split, synthetic_recording
+from d2_plugin.recordings.synthetic.room import furnished_room, synthetic_recording
 
 
 @pytest.fixture(scope="module")
@@ -23,15 +23,6 @@ def world_points(camera: Camera, depth: np.ndarray) -> np.ndarray:
     pixels = np.stack([u, v, np.ones_like(u)], axis=-1).reshape(-1, 3)
     in_camera = pixels @ np.linalg.inv(camera.K).T * depth.reshape(-1, 1)
     return (in_camera - camera.T_camera_world[:3, 3]) @ camera.T_camera_world[:3, :3]
-
-
-def test_training_and_held_out_cameras_are_told_by_name(recording: Recording) -> None:
-    train, test = split(recording)
-    assert train == ["train0", "train1", "train2", "train3"]
-    assert test == ["test0", "test1", "test2"]
-    centres = {name: camera.centre for name, camera in recording.cameras.items()}
-    for i, name in enumerate(test):  # each stands between two neighbours
-        assert centres[f"train{i}"][0] < centres[name][0] < centres[f"train{i + 1}"][0]
 
 
 def test_depth_says_where_another_camera_sees_the_same_surface(recording: Recording) -> None:
@@ -76,27 +67,11 @@ def test_depth_matches_the_sphere_it_is_told_to_be() -> None:
     assert on_ball.sum() > 50
 
 
-def test_every_pixel_has_a_depth_inside_the_declared_bounds(recording: Recording) -> None:
-    for name, camera in recording.cameras.items():
-        depth = recording.depth(name, 0)
-        assert camera.near_far[0] < depth.min()
-        assert depth.max() < camera.near_far[1]
-
-
 def test_things_move_unless_they_are_told_to_stand_still(recording: Recording) -> None:
     moved = (np.abs(recording.image("train0", 0).astype(int) - recording.image("train0", 5)).max(-1) > 20).mean()
     assert 0.01 < moved < 0.3
     still = synthetic_recording(frames=3, width=64, height=36, moving=False)
     np.testing.assert_array_equal(still.image("train0", 0), still.image("train0", 2))
-
-
-def test_images_are_textured_but_for_the_plaster(recording: Recording) -> None:
-    image, camera = recording.image("train1", 0).astype(float), recording.cameras["train1"]
-    gradient = np.abs(np.diff(image, axis=1)).mean(-1)
-    points = world_points(camera, recording.depth("train1", 0)).reshape(camera.height, camera.width, 3)
-    left_wall, bricks = points[:, :-1, 0] < -2.59, points[:, :-1, 1] > 1.99
-    assert left_wall.sum() > 100
-    assert np.median(gradient[left_wall]) < 0.3 * np.median(gradient[bricks])
 
 
 def test_the_same_arguments_give_the_same_recording(recording: Recording) -> None:
@@ -116,9 +91,8 @@ def test_emulated_maps_are_affine_in_inverse_depth_up_to_a_local_bias(recording:
         assert slope > 0
         error = np.abs(slope * mono + offset - inverse) / inverse
         assert 0.01 < np.median(error) < 0.15
-    scales = [
-        np.ptp(recording.mono("train2", frame)) / np.ptp(1 / recording.depth("train2", frame)) for frame in range(6)
-    ]
+    maps = [(recording.mono("train2", frame), 1 / recording.depth("train2", frame)) for frame in range(6)]
+    scales = [np.ptp(mono) / np.ptp(inverse) for mono, inverse in maps]
     assert max(scales) > 1.3 * min(scales)  # every frame has its own scale
 
 

@@ -31,16 +31,12 @@ def rig(path: Path, cameras: int = 3, frames: tuple[int, ...] = (151, 152), **op
     return path
 
 
-def test_the_last_two_numbers_of_a_name_are_frame_and_camera(tmp_path: Path) -> None:
+def test_a_line_is_a_camera_and_the_last_two_numbers_of_a_name_are_frame_and_camera(tmp_path: Path) -> None:
     recording = open_recording(rig(tmp_path / "Birthday"))
     assert recording.layout == "technicolor"
     assert list(recording.cameras) == ["00", "01", "02"]
     assert (recording.frames, recording.fps) == ((151, 152), 30)
     assert (recording.image("02", 152) == 21).all()
-
-
-def test_the_principal_point_is_not_the_centre_and_fy_is_scaled(tmp_path: Path) -> None:
-    recording = open_recording(rig(tmp_path / "Birthday"))
     camera = recording.cameras["01"]
     np.testing.assert_allclose(camera.K, [[30.5, 0, 17.25], [0, 1.02 * 30.5, 6.5], [0, 0, 1]], atol=1e-12)
     # A quaternion (.6, 0, .8, 0) turns by 2 atan(.8 / .6) about y; the pose maps world to camera.
@@ -49,8 +45,6 @@ def test_the_principal_point_is_not_the_centre_and_fy_is_scaled(tmp_path: Path) 
     np.testing.assert_allclose(camera.T_camera_world[:3, :3], rotation, atol=1e-12)
     np.testing.assert_array_equal(camera.T_camera_world[:3, 3], [0.1, -0.2, 0.3])
     assert camera.near_far == (1.75, 10.0)
-    half = open_recording(tmp_path / "Birthday", downscale=2).cameras["01"]
-    np.testing.assert_allclose(half.K[:2, 2], [8.625, 3.25])
 
 
 def test_the_distorted_release_is_undistorted_on_load(tmp_path: Path) -> None:
@@ -61,9 +55,7 @@ def test_the_distorted_release_is_undistorted_on_load(tmp_path: Path) -> None:
     recording = open_recording(path)
     np.testing.assert_array_equal(recording.cameras["00"].T_camera_world[:3, 3], [0.1, -0.2, 0.3])
     assert any("distortion of 00, 01, 02 is undone" in note for note in recording.notes)
-    shown = recording.image("00", 151)
-    assert (shown[6, 17] == 200).all()
-    assert (shown[0, 0] == 0).all()
+    assert (recording.image("00", 151)[0, 0] == 0).all()
     already = open_recording(rig(tmp_path / "again", scene="Train", line=f"{INTRINSICS} 0.4 0.05 {POSE}"))
     assert (already.image("01", 151) == 10).all()
     assert not any("undone" in note for note in already.notes)
@@ -81,20 +73,9 @@ def test_known_damaged_images_are_replaced_and_named(tmp_path: Path) -> None:
     assert not other.notes
 
 
-@pytest.mark.parametrize(
-    ("line", "message"),
-    [
-        (f"{INTRINSICS} 0.1 {POSE}", "line 2 of .* has 13 numbers, expected 12 .* or 14"),
-        (f"{INTRINSICS} a b {POSE}", "cannot read"),
-        (f"{INTRINSICS} 0 0 0 0 0 0 0", "length zero"),
-        ("-3 1 1 1 0 1 0 0 0 0 0 0", "focal lengths"),
-    ],
-)
-def test_lines_that_cannot_be_are_refused(tmp_path: Path, line: str, message: str) -> None:
-    refused(rig(tmp_path / "a", line=line), message)
-
-
-def test_folders_that_cannot_be_are_refused(tmp_path: Path) -> None:
+def test_files_that_cannot_be_are_refused(tmp_path: Path) -> None:
+    refused(rig(tmp_path / "b", line=f"{INTRINSICS} 0.1 {POSE}"), "line 2 of .* has 13 numbers, expected 12 .* or 14")
+    refused(rig(tmp_path / "b", line=f"{INTRINSICS} 0 0 0 0 0 0 0"), "length zero")
     path = rig(tmp_path / "a", frames=())
     refused(path, "no images in .*: expected names like Birthday_undist")
     rig(path)

@@ -26,22 +26,18 @@ def entry(name: str, x: float = 0.0, **more: object) -> dict:
     """An image of a camera at (x, 0, 0) that looks along -z of the world, as Blender's do."""
     matrix = np.eye(4)
     matrix[0, 3] = x
-    return {"file_path": name, "transform_matrix": matrix.tolist(), **more}
+    return {"file_path": name, "transform_matrix": matrix.tolist()} | more
 
 
-def write(path: Path, frames: Frames, file: str = "transforms.json", images: bool = True, **top: object) -> Path:
-    if images:
-        for i, frame in enumerate(frames):
-            name = frame["file_path"]
-            image(path / (name if name.endswith(".png") else f"{name}.png"), i)
+def write(path: Path, frames: Frames, file: str = "transforms.json", **top: object) -> Path:
+    for i, frame in enumerate(frames):
+        image(path / f"{frame['file_path']}.png", i)
     (path / file).write_text(json.dumps({"camera_angle_x": 1.0, **top, "frames": frames}))
     return path
 
 
 def two_by_two(**more: object) -> Frames:
-    return [
-        entry(f"images/cam{c:02d}_{f:04d}", x=c, time=f / 30, **more) for c in (0, 7) for f in (0, 1)
-    ]  # fmt: skip
+    return [entry(f"images/cam{c:02d}_{f:04d}", x=c, time=f / 30, **more) for c in (0, 7) for f in (0, 1)]
 
 
 def test_the_angle_of_view_is_the_focal_length(tmp_path: Path) -> None:
@@ -67,7 +63,6 @@ def test_distortion_beside_a_image_is_undone(tmp_path: Path) -> None:
     recording = open_recording(write(tmp_path, frames))
     assert any("distortion of cam00, cam07 is undone" in note for note in recording.notes)
     assert (recording.image("cam07", 1)[0, 0] == 0).all()
-    assert (recording.image("cam07", 1)[12, 16] == 3).all()
     fisheye = two_by_two(fl_x=30.0, camera_model="OPENCV_FISHEYE")
     assert any("undone" in note for note in open_recording(write(tmp_path, fisheye)).notes)
     refused(write(tmp_path, two_by_two(fl_x=30.0, k4=0.1)), "6 distortion coefficients")
@@ -127,27 +122,13 @@ def test_missing_images_are_named_and_left_out_only_when_asked(tmp_path: Path) -
     refused(tmp_path, "unknown camera 'cam1'", cameras=["cam1"], intersect=True)
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"transform_matrix": [[1, 0], [0, 1]]}, "cannot be understood"),
-        ({"transform_matrix": np.full((4, 4), np.nan).tolist()}, "not finite"),
-        ({"transform_matrix": (2 * np.eye(4)).tolist()}, "no rotation"),
-        ({"time": None}, "time of an image in .* must be a number, got None"),
-        ({"fl_x": "long"}, "fl_x of camera a .* must be a number, got 'long'"),
-        ({"fl_x": -3}, "focal lengths"),
-    ],
-)
-def test_entries_that_cannot_be_are_refused(tmp_path: Path, changes: dict, message: str) -> None:
-    refused(write(tmp_path, [entry("a_0", time=0.0) | changes]), message)
-
-
 def test_files_that_cannot_be_are_refused(tmp_path: Path) -> None:
-    write(tmp_path, [], frames_="none")
+    write(tmp_path, [])
     refused(tmp_path, "that lists images")
     (tmp_path / "transforms.json").write_text('{"camera_angle_x": 1}')
     refused(tmp_path, "has no list 'frames'")
-    refused(write(tmp_path, [{"transform_matrix": []}], images=False), "has no file_path")
+    refused(write(tmp_path, [entry("a_0", time=None)]), "time of an image in .* must be a number, got None")
+    refused(write(tmp_path, [entry("a_0", transform_matrix=[[1, 0], [0, 1]])]), "cannot be understood")
     refused(write(tmp_path, [entry("a_0", time=0.0), entry("a_1")]), "some images .* have a time")
     (tmp_path / "transforms.json").write_text(json.dumps({"frames": [entry("a_0")]}))
     refused(tmp_path, "neither fl_x nor camera_angle_x")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -62,16 +63,6 @@ class TestFocalLengths:
 class TestBoards:
     """Corners are matches, however little else two cameras share."""
 
-    def test_a_board_alone_settles_cameras_forty_degrees_apart(self) -> None:
-        truth = arc(3, 40.0, 0.75)
-        images, board = held(truth, 0.2, 4)
-        rig = solve_rig(images, truth, board=board)
-        degrees, share = worst(rig.cameras, truth)
-        assert degrees < 0.1
-        assert share < 0.003
-        scaled = scaled_by_board(rig, images, board)
-        assert rig_width(scaled.cameras.values()) == pytest.approx(rig_width(truth.values()), rel=0.005)
-
     def test_an_inverted_board_and_one_of_older_programs_are_seen(self) -> None:
         images, board = filmed(arc(2), 0.25)
         assert len(board.corners(255 - images["c0"][0])) == len(board.corners(images["c0"][0])) == 24
@@ -115,17 +106,10 @@ class TestBoards:
         with pytest.raises(D2Error, match="saw 0 sides of the board's squares .* show the whole board"):
             scaled_by_board(rig, half, replace(board, marker=None))
 
-    @pytest.mark.parametrize(
-        "text",
-        ["", "charuco", "charuco:7x5:0.04", "charuco:7x5:0.03:0.04", "charuco:2x5:0.04:0.03", "checkerboard:9x6:-1"]
-        + ["checkerboard:9:0.1", "checkerboard:9x6:0.1:0.05", "chess:9x6:0.1", "charuco:7x5:nan:0.03"],
-    )
-    def test_words_that_are_no_board(self, text: str) -> None:
-        with pytest.raises(D2Error, match="expected charuco:COLUMNSxROWS:SQUARE:MARKER"):
-            Board.parsed(text)
-
-    def test_words_that_are_one(self) -> None:
-        assert Board.parsed("charuco:7x5:0.04:0.03") == Board(7, 5, 0.04, 0.03)
+    def test_words_are_a_board_or_refused(self) -> None:
+        for text in ("", "charuco:7x5:0.04", "charuco:7x5:0.03:0.04", "checkerboard:9x6:-1", "chess:9x6:0.1"):
+            with pytest.raises(D2Error, match="expected charuco:COLUMNSxROWS:SQUARE:MARKER"):
+                Board.parsed(text)
         assert Board.parsed("charuco:7x5:0.04:0.03:DICT_5X5_50") == Board(7, 5, 0.04, 0.03, "DICT_5X5_50")
         assert Board.parsed("checkerboard:9x6:0.025") == Board(9, 6, 0.025)
 
@@ -155,9 +139,8 @@ class TestPlaces:
 
     def test_what_stands_still_is_one_witness(self) -> None:
         rng = np.random.default_rng(0)
-        wall = np.repeat(
-            cv2.GaussianBlur(rng.uniform(0, 255, (120, 160)).astype(np.float32), (0, 0), 2)[..., None], 3, 2
-        )
+        noise = cv2.GaussianBlur(rng.uniform(0, 255, (120, 160)).astype(np.float32), (0, 0), 2)
+        wall = np.repeat(noise[..., None], 3, 2)
         taken = []
         for moment in range(5):
             image = wall.copy()
@@ -224,7 +207,6 @@ BAD_WORDS = [
     (["--focal", "700", "--intrinsics", "CALIBRATION"], r"--intrinsics and --focal both say how the lenses are"),
     (["--distance", "02,05"], r"--distance says '02,05', expected CAMERA,CAMERA,METRES"),
     (["--distance", "02,02,1"], r"--distance says '02,02,1', expected"),
-    (["--distance", "02,05,0"], r"--distance says '02,05,0', expected"),
     (["--board", "a4"], r"--board says 'a4', expected charuco"),
     (["--stills", "FOLDER"], r"--stills .* is no folder with images"),
 ]
@@ -232,8 +214,6 @@ BAD_WORDS = [
 
 @pytest.mark.parametrize(("words", "says"), BAD_WORDS)
 def test_words_that_say_nothing(soft: Filmed, tmp_path: Path, capsys, words: list[str], says: str) -> None:
-    import re
-
     (tmp_path / "empty").mkdir()
     places = {"CALIBRATION": str(soft.calibration), "FOLDER": str(tmp_path / "empty")}
     given = [places.get(word, word) for word in words]

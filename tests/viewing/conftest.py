@@ -33,6 +33,14 @@ def trained(room: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
+def bare(room: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a run of two steps without any hook."""
+    folder = tmp_path_factory.mktemp("runs") / "bare"
+    Run(RunSettings(str(room), CAMERAS[:2], iterations=2, hooks=()), folder).train()
+    return folder
+
+
+@pytest.fixture(scope="session")
 def viewed(trained: Path) -> ViewedRun:
     """The same run, opened."""
     return viewed_run(trained)

@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 import pickle
+import zipfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from mimics import fudan, spacetime
+from mimics import fudan, hust4d, spacetime, swift4d
 from oracles.export_files import ReadPage
 from torch import Tensor
 from viewing import official
 
 from d2_plugin import registry
+from d2_plugin.adapters.fudan import FudanAdapter
+from d2_plugin.adapters.spacetime import SpacetimeAdapter
 from d2_plugin.commands.cli import main
 from d2_plugin.errors import D2Error
-from d2_plugin.protocol import View
+from d2_plugin.protocol import Splats, View
 from d2_plugin.viewing.checkpoints import open_viewed
 from d2_plugin.viewing.checkpoints.files import read_options, read_ply
 from d2_plugin.viewing.checkpoints.models import FOUR_C, FOUR_C_STATIC, FUDAN, PLANES, STATIC
@@ -56,8 +59,6 @@ class TestTuples:
     def test_4d_gaussians_are_shown_as_their_adapter_slices_them(
         self, room: Path, tmp_path: Path, layout: tuple[str, ...]
     ) -> None:
-        from d2_plugin.adapters.fudan import FudanAdapter
-
         model = self.checkpoint(tmp_path / "chkpnt30000.pth", layout)
         found = open_viewed(tmp_path / "chkpnt30000.pth", room, ["train0", "train1"])
         assert found.test_cameras == ("train2", "test0")
@@ -84,16 +85,9 @@ class TestTuples:
         rewritten(path, with_own + b"\n", core + b".multiarray\n")
         assert len(open_viewed(path, room).backbone)
 
-    def test_another_number_of_entries_is_refused_by_name(self, room: Path, tmp_path: Path) -> None:
-        torch.save((tuple(range(40)), 1), tmp_path / "chkpnt1.pth")
-        with pytest.raises(D2Error, match=r"has 40 entries, expected 19 \(fudan\), 21 \(4C4D\).*Viewer\(d2\)"):
-            open_viewed(tmp_path / "chkpnt1.pth", room)
-
 
 def rewritten(path: Path, old: bytes, new: bytes) -> None:
     """Replace bytes in the pickle inside a file of torch.save."""
-    import zipfile
-
     with zipfile.ZipFile(path) as archive:
         parts = {name: archive.read(name) for name in archive.namelist()}
     [pickled] = [name for name in parts if name.endswith("data.pkl")]
@@ -131,29 +125,21 @@ class TestDeformable3D:
         half = found.duration / 2
         assert seen(found, half).time == pytest.approx(0.5)
         drawn = found.backbone.slice_at(seen(found, official.TIME * found.duration))
-        expected = torch.tensor(official.DEFORMED["plain"][0])
-        assert close(drawn.means[:3] - official.POINTS, expected)
-        # Offsets of scales come after exp; quaternions are not normalised again.
-        scales = model["_scaling"][:3].exp() + torch.tensor(official.DEFORMED["plain"][2])
-        q = torch.nn.functional.normalize(model["_rotation"][:3]) + torch.tensor(official.DEFORMED["plain"][1])
-        trace = drawn.covariances[:3, [0, 3, 5]].sum(1)
-        # Of a quaternion of length |q| the columns of Inria's matrix are not unit vectors.
-        w, x, y, z = q.unbind(1)
-        first = torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], -1).square().sum(1)
-        second = torch.stack([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)], -1).square().sum(1)
-        third = torch.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], -1).square().sum(1)
-        assert close(trace, (torch.stack([first, second, third], -1) * scales**2).sum(1), 1e-2)
+        means, rotations, scales = (torch.tensor(offsets) for offsets in official.DEFORMED["plain"])
+        assert close(drawn.means[:3] - official.POINTS, means)
+        # Offsets of scales come after exp. Quaternions are not normalised again, and of one whose length is not 1 the
+        # columns of Inria's matrix are no unit vectors.
+        w, x, y, z = (torch.nn.functional.normalize(model["_rotation"][:3]) + rotations).unbind(1)
+        rows = [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+        factors = (
+            torch.stack([torch.stack(row, -1) for row in rows], 1) * (model["_scaling"][:3].exp() + scales)[:, None]
+        )
+        assert close(drawn.covariances[:3, [0, 3, 5]].sum(1), factors.square().sum((1, 2)), 1e-2)
         assert found.backbone.colors(seen(found, half), drawn).shape == (40, 3)
-
-    def test_a_point_cloud_without_its_network_or_with_another_is_refused(self, room: Path, tmp_path: Path) -> None:
-        self.output(tmp_path)
-        weights = tmp_path / "deform" / "iteration_40000" / "deform.pth"
-        torch.save({"layer.weight": torch.zeros(3)}, weights)
-        with pytest.raises(D2Error, match=r"has no linear\.0\.weight: it is no network of Deformable-3D-Gaussians"):
-            open_viewed(tmp_path, room)
-        weights.unlink()
-        with pytest.raises(D2Error, match="a point cloud of Deformable-3D-Gaussians moves by it, copy both"):
-            open_viewed(tmp_path, room)
 
     def test_d2_view_takes_the_folder_for_a_checkpoint_and_not_for_a_recording(
         self, room: Path, tmp_path: Path
@@ -162,6 +148,13 @@ class TestDeformable3D:
         assert len(viewed_at(ViewSettings(tmp_path, recording=room)).backbone) == 40
         with pytest.raises(D2Error, match=r"point_cloud\.ply does not say where its cameras stood"):
             viewed_at(ViewSettings(tmp_path))
+        weights = tmp_path / "deform" / "iteration_40000" / "deform.pth"
+        torch.save({"layer.weight": torch.zeros(3)}, weights)
+        with pytest.raises(D2Error, match=r"has no linear\.0\.weight: it is no network of Deformable-3D-Gaussians"):
+            open_viewed(tmp_path, room)
+        weights.unlink()
+        with pytest.raises(D2Error, match="a point cloud of Deformable-3D-Gaussians moves by it, copy both"):
+            open_viewed(tmp_path, room)
 
 
 class Test4DGaussians:
@@ -250,8 +243,6 @@ def still(count: int) -> dict[str, object]:
 
 class TestClouds:
     def test_a_point_cloud_of_spacetime_gaussians_moves_with_the_recording(self, room: Path, tmp_path: Path) -> None:
-        from d2_plugin.adapters.spacetime import SpacetimeAdapter
-
         gaussians = spacetime.make()[0]
         generator = torch.Generator().manual_seed(4)
         gaussians._motion = 0.2 * torch.randn(gaussians._motion.shape, generator=generator)
@@ -286,8 +277,6 @@ class TestClouds:
         assert {"x", "opacity", "rot_3"} <= set(read_ply(first))
 
     def test_a_point_cloud_of_4c4d_has_its_time(self, room: Path, tmp_path: Path) -> None:
-        from d2_plugin.adapters.fudan import FudanAdapter
-
         model = fudan.make()[0]
         columns = {axis: model._xyz[:, i] for i, axis in enumerate("xyz")} | {"opacity": model._opacity[:, 0]}
         parts = {"f_dc": model._features_dc[:, 0], "scale": model._scaling, "rot": model._rotation}
@@ -353,17 +342,12 @@ class TestRefused:
         torch.save({"weights": torch.zeros(3)}, path)
         with pytest.raises(D2Error, match="is no checkpoint that can be shown"):
             open_viewed(path, room)
+        torch.save((tuple(range(40)), 1), path)
+        with pytest.raises(D2Error, match=r"has 40 entries, expected 19 \(fudan\), 21 \(4C4D\).*Viewer\(d2\)"):
+            open_viewed(path, room)
         (tmp_path / "a.ply").write_bytes(b"ply\nformat binary_little_endian 1.0\nelement vertex -1\nend_header\n")
         with pytest.raises(D2Error, match="it says -1 vertices"):
             open_viewed(tmp_path / "a.ply", room)
-        (tmp_path / "a.ply").write_bytes(b"ply\nformat ascii 1.0\nend_header\n")
-        with pytest.raises(D2Error, match="no readable point cloud"):
-            open_viewed(tmp_path / "a.ply", room)
-        head = b"ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty " + b"f" * 5000 + b" x\nend_header\n"
-        (tmp_path / "a.ply").write_bytes(head)
-        with pytest.raises(D2Error) as refusal:
-            open_viewed(tmp_path / "a.ply", room)
-        assert len(str(refusal.value)) < 1000
         assert main(["render", str(path), "--recording", str(room)]) == 2
         assert capsys.readouterr().err.count("\n") == 1
 
@@ -372,8 +356,6 @@ class TestRefused:
         [
             ("_rotation", torch.zeros(20, 3), "cannot read checkpoint"),
             ("_scaling", torch.zeros(7, 3), "cannot read checkpoint"),
-            ("_xyz", "text", "cannot read checkpoint"),
-            ("_features_dc", torch.zeros(20, 3), "cannot read checkpoint"),
             ("_opacity", None, "cannot read checkpoint"),
             ("_xyz", torch.full((20, 3), torch.nan), "numbers that are not finite"),
         ],
@@ -387,14 +369,19 @@ class TestRefused:
         assert "\n" not in str(caught.value)
 
 
+def furthest(page: ReadPage, true: Splats, time: float) -> Tensor:
+    """How far the visible Gaussian that the page misses by most is from what it draws."""
+    told = page.at(time)
+    drawn = told.positions[told.opacities >= 1 / 255]
+    return torch.cdist(true.means[true.opacities >= 1 / 255].double(), drawn).amin(1).max()
+
+
 class TestExport:
     """`d2 export` of a checkpoint: straight lines exactly where it has them, baked key times where not."""
 
     def test_4d_gaussians_become_the_same_straight_lines(
         self, room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
-        from d2_plugin.adapters.fudan import FudanAdapter
-
         path = tmp_path / "chkpnt30000.pth"
         model = TestTuples.checkpoint(path)
         assert main(["export", str(path), "--recording", str(room), "--train-cameras", "train0,train1"]) == 0
@@ -405,9 +392,7 @@ class TestExport:
         assert [camera["held_out"] for camera in page.header["cameras"]] == [False, False, True, True]
         for time in (0.0, 0.1, 0.25):
             true = FudanAdapter(model).slice_at(seen(open_viewed(path, room), time))
-            told = page.at(time)
-            drawn = told.positions[told.opacities >= 1 / 255]
-            assert torch.cdist(true.means[true.opacities >= 1 / 255].double(), drawn).amin(1).max() < 1e-3
+            assert furthest(page, true, time) < 1e-3
 
     def test_a_network_is_baked(self, room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         Test4DGaussians.output(tmp_path)
@@ -417,21 +402,12 @@ class TestExport:
         page = ReadPage(tmp_path / "export" / "scene.html")
         assert page.coefficients.shape[1:] == (16, 3)
         at = found.recording.seconds(found.recording.frames[-1])
-        true, told = found.backbone.slice_at(seen(found, at)), page.at(at)
-        drawn = told.positions[told.opacities >= 1 / 255]
-        assert torch.cdist(true.means[true.opacities >= 1 / 255].double(), drawn).amin(1).max() < 1e-3
-
-    def test_without_its_recording_it_is_refused(self, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-        TestTuples.checkpoint(tmp_path / "chkpnt1.pth")
-        assert main(["export", str(tmp_path / "chkpnt1.pth")]) == 2
-        assert "name its recording with --recording" in capsys.readouterr().err
+        assert furthest(page, found.backbone.slice_at(seen(found, at)), at) < 1e-3
 
 
 @pytest.mark.parametrize("name", ["hust4d", "swift4d"])
 def test_live_colours_are_those_that_the_field_leaves(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Configurations for several cameras deform harmonics (no_dshs=False); Swift4D those of what moves alone."""
-    from mimics import hust4d, swift4d
-
     trainer = {"hust4d": hust4d, "swift4d": swift4d}[name]
     model, scene = trainer.make()
     model.training_setup(trainer.default_options(), *([None] if name == "swift4d" else []))

@@ -18,7 +18,6 @@ from d2_plugin.commands.cli import main
 from d2_plugin.errors import D2Error, MissingExtra
 from d2_plugin.recordings.images import read_image
 from d2_plugin.runs.run import Run
-from d2_plugin.runs.settings import RunSettings
 from d2_plugin.runs.start import make_view
 from d2_plugin.viewing.panels import KINDS, Shot
 from d2_plugin.viewing.videos.plan import RenderSettings, plan_video
@@ -65,10 +64,8 @@ def test_a_held_out_camera_plays_the_whole_recording_as_the_rasterizer_draws_it(
 
 
 def test_an_orbit_has_the_asked_length_rate_and_odd_size(trained: Path, tmp_path: Path) -> None:
-    settings = RenderSettings(
-        (trained,), output=tmp_path / "a.mp4", path="orbit", seconds=0.5, fps=20, width=63, height=35, speed=0.25
-    )
-    assert "the file has 64x36" in run(settings)
+    size = {"seconds": 0.5, "fps": 20, "width": 63, "height": 35, "speed": 0.25}
+    assert "the file has 64x36" in run(RenderSettings((trained,), output=tmp_path / "a.mp4", path="orbit", **size))
     with av.open(str(tmp_path / "a.mp4")) as container:
         stream = container.streams.video[0]
         assert (stream.width, stream.height, stream.frames, stream.average_rate) == (64, 36, 10, 20)
@@ -106,16 +103,9 @@ def test_time_plays_bounces_slows_and_freezes(viewed: ViewedRun) -> None:
         plan_video(viewed, RenderSettings((), at=3.0))
 
 
-@pytest.mark.parametrize(
-    ("settings", "says"),
-    [
-        ({"seconds": 1e6}, "would have 1.2e.07 images, at most 1000000"),
-        ({"speed": 1e-6}, "images, at most 1000000: choose fewer --seconds"),
-        ({"path": "orbit", "seconds": 1e6}, "images, at most 1000000"),
-    ],
-)
-def test_a_video_without_end_is_refused_before_it_is_laid_out(viewed: ViewedRun, settings: dict, says: str) -> None:
-    with pytest.raises(D2Error, match=says):
+@pytest.mark.parametrize("settings", [{"seconds": 1e6}, {"speed": 1e-6}, {"path": "orbit", "seconds": 1e6}])
+def test_a_video_without_end_is_refused_before_it_is_laid_out(viewed: ViewedRun, settings: dict) -> None:
+    with pytest.raises(D2Error, match="images, at most 1000000: choose fewer --seconds"):
         plan_video(viewed, RenderSettings((), **settings))
 
 
@@ -160,8 +150,6 @@ def test_what_cannot_be_shown_is_one_sentence(
     assert "holds no run" in refused(capsys, "render", tmp_path)
     assert "no run at" in refused(capsys, "render", tmp_path / "none")
     assert "d2 render needs RUN" in refused(capsys, "render")
-    assert "has no Gaussian left at step 40" in refused(capsys, "render", emptied(trained, tmp_path / "empty"))
-    assert "version 99" in refused(capsys, "render", of_another_version(trained, tmp_path / "later"))
     for more in (["--recording", room], ["--train-cameras", "train0"], ["--downscale", "2"]):
         assert "is a folder of a run, which knows its recording" in refused(capsys, "render", trained, *more)
     assert "did you mean 'orbit'?" in refused(capsys, "render", trained, "--path", "orbti")
@@ -170,20 +158,23 @@ def test_what_cannot_be_shown_is_one_sentence(
     assert "at the recording's cameras only" in refused(capsys, "render", trained, "--path", "orbit", "--show", "error")
 
 
-def test_a_run_that_still_trains_is_shown_with_a_note(
-    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize("command", ["render", "view", "export"])
+def test_a_run_of_which_nothing_is_left_or_known_is_one_sentence(
+    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str
 ) -> None:
-    copy = still_training(trained, tmp_path / "<script>alert(1)<", 33)
-    assert main(["render", str(copy), "--output", str(tmp_path / "a.mp4")]) == 0
-    assert f"{copy.name} still trains: this is step 33 of 40" in capsys.readouterr().out
-    (copy / "checkpoint.pt").unlink()
-    assert "holds no checkpoint yet" in refused(capsys, "render", copy)
+    assert "has no Gaussian left at step 40" in refused(capsys, command, emptied(trained, tmp_path / "empty"))
+    assert "version 99" in refused(capsys, command, of_another_version(trained, tmp_path / "later"))
+    (tmp_path / "empty" / "checkpoint.pt").unlink()
+    assert "holds no checkpoint yet" in refused(capsys, command, tmp_path / "empty")
 
 
-def test_a_run_without_a_prior_shows_all_but_it(room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    folder = tmp_path / "bare"
-    Run(RunSettings(str(room), ("train0", "train1"), iterations=2, hooks=()), folder).train()
-    assert main(["render", str(folder), "--output", str(tmp_path / "a.webp"), "--format", "webp"]) == 0
+@pytest.mark.parametrize("command", ["render", "export"])
+def test_a_run_that_still_trains_and_has_no_prior_is_shown_with_a_note(
+    bare: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str
+) -> None:
+    copy = still_training(bare, tmp_path / "<script>alert(1)<", 1)
+    assert main([command, str(copy), "--output", str(tmp_path / "out.mp4")]) == 0
+    assert f"{copy.name} still trains: this is step 1 of 2" in capsys.readouterr().out
 
 
 def soft(count: int, width: int, height: int) -> list[np.ndarray]:
@@ -207,8 +198,7 @@ def write(path: Path, images: list[np.ndarray], fps: float = 30, form: str = "mp
     ("width", "height", "fps", "rate"),
     [
         (64, 48, 24, 24),
-        (63, 48, 29.97, Fraction(30000, 1001)),
-        (64, 47, 23.976, Fraction(24000, 1001)),
+        (63, 47, 29.97, Fraction(30000, 1001)),
         (61, 43, 12.5, 12.5),
     ],
 )

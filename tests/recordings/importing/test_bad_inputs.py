@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -15,7 +16,7 @@ from recorded import Filmed, Shooting, video, write_video
 from stand_in_recordings import renamed
 
 from d2_plugin.commands.cli import main
-from d2_plugin.recordings import Recording, open_recording, select_frames
+from d2_plugin.recordings import Recording, open_recording
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 
 pytest.importorskip("av")
@@ -49,10 +50,16 @@ def given(filmed: Filmed, tmp_path: Path) -> Filmed:
     return Filmed(tmp_path / "given", tmp_path / "given" / "cameras.json")
 
 
-def change(given: Filmed, edit: Callable[[dict[str, Any]], None]) -> None:
+def importing(given: Filmed, output: Path, *more: str) -> list[str]:
+    """The command that imports the videos without measuring exposures."""
+    words = ["import", str(given.videos), "--calibration", str(given.calibration), "--output", str(output)]
+    return [*words, "--exposure", "false", *more]
+
+
+def change(given: Filmed, edit: Callable[[dict[str, Any]], object]) -> None:
     """Spoil the calibration."""
     table = json.loads(given.calibration.read_text())
-    edit({camera["name"]: camera for camera in table["cameras"]} | {"all": table})
+    edit({camera["name"]: camera for camera in table["cameras"]})
     given.calibration.write_text(json.dumps(table))
 
 
@@ -99,20 +106,15 @@ def edited(edit: Callable[[dict[str, Any]], object]) -> Callable[[Filmed], None]
     return lambda given: change(given, edit)
 
 
-def overwritten(name: str, content: bytes | None) -> Callable[[Filmed], None]:
-    """Writes something else into a file, or removes it."""
-
-    def spoil(given: Filmed) -> None:
-        path = given.folder / name
-        path.unlink() if content is None else path.write_bytes(content)
-
-    return spoil
+def overwritten(name: str, content: bytes) -> Callable[[Filmed], object]:
+    """Writes something else into a file."""
+    return lambda given: (given.folder / name).write_bytes(content)
 
 
-def flipped(table: dict[str, Any], *names: str) -> None:
+def flipped(cameras: dict[str, Any]) -> None:
     """Poses as a tool with left-handed axes writes them."""
-    for name in names:
-        table[name].update(R=(np.array(table[name]["R"]) @ np.diag([1.0, 1.0, -1.0])).tolist())
+    for camera in cameras.values():
+        camera.update(R=(np.array(camera["R"]) @ np.diag([1.0, 1.0, -1.0])).tolist())
 
 
 def of_another_rig(given: Filmed) -> None:
@@ -128,7 +130,6 @@ def of_another_rig(given: Filmed) -> None:
 
 
 def called_alike(given: Filmed) -> None:
-    (given.videos / "more").mkdir()
     shutil.copy(given.videos / "03.mp4", given.videos / "03.mov")
 
 
@@ -137,7 +138,6 @@ CASES: list[tuple[Callable[[Filmed], object], list[str], str]] = [
     (damaged, [], r"can(not)? be decoded.*(repair|replace) the"),
     (cut_off, [], r"cannot read video .*03\.mp4.*replace the file or leave camera 03 out"),
     (overwritten("videos/03.mp4", b"not a video\n" * 1000), [], r"03\.mp4.*replace the file or leave camera 03 out"),
-    (overwritten("videos/03.mp4", b""), [], r"03\.mp4.*replace the file or leave camera 03 out"),
     (only_sound, [], r"03\.mp4 holds audio and no image: give a video"),
     (lambda given: [path.unlink() for path in given.videos.iterdir()], [], r"holds no video: give videos, or a folder"),
     (called_alike, [], r"are both called 03: name each video like its camera"),
@@ -148,11 +148,7 @@ CASES: list[tuple[Callable[[Filmed], object], list[str], str]] = [
         [],
         r"does not fit the videos: .*03",
     ),
-    (edited(lambda c: flipped(c, "03")), [], r"camera 03 .*mirrored.*right-handed"),
-    (edited(lambda c: flipped(c, *NAMES)), [], r"camera 02 .*mirrored.*right-handed"),
-    (of_another_rig, [], r"does not fit the videos: "),
-    (edited(lambda c: c["03"].update(t=[float("nan"), 0, 0])), [], r"(NaN|not finite)"),
-    (edited(lambda c: c["03"].update(width=2 * c["03"]["width"])), [], r"another aspect"),
+    (edited(flipped), [], r"camera 02 .*mirrored.*right-handed"),
     (
         edited(lambda c: [c[name].update(t=[1000 * value for value in c[name]["t"]]) for name in NAMES]),
         [],
@@ -163,19 +159,14 @@ CASES: list[tuple[Callable[[Filmed], object], list[str], str]] = [
         [],
         r"puts all cameras at one place: give a calibration with their poses|does not fit",
     ),
-    (edited(lambda c: c["all"]["cameras"].remove(c["03"])), [], r"no camera for 03"),
     (edited(lambda c: c["03"].update(R=c["02"]["R"], t=c["02"]["t"])), [], r"cameras 02 and 03 the identical pose"),
     (overwritten("cameras.json", b"<?xml version='1.0'?><calibration/>"), [], r"\(qualisys\) describes no camera"),
     (overwritten("cameras.json", b"<?xml version='1.0'?><opencv_storage/>"), [], r"is no calibration that can be read"),
     (overwritten("cameras.json", b"<!DOCTYPE a [<!ENTITY b 'c'>]><calibration/>"), [], r"declares entities"),
-    (overwritten("cameras.json", b"{]"), [], r"not JSON|no calibration that can be read"),
-    (overwritten("cameras.json", None), [], r"no such calibration|there is no such file|is not there"),
     (lambda given: None, ["--offsets", "07=3"], r"--offsets names camera '07', have 02, 03, 04"),
     (lambda given: None, ["--offsets", "03=soon"], r"--offsets says '03=soon', expected auto, .* or NAME=FRAMES"),
     (lambda given: None, ["--offsets", "03=900"], r"camera 0\d stopped .* seconds before camera 03 began"),
     (lambda given: None, ["--offsets", "timecode"], r"nothing in the timecode links"),
-    (lambda given: None, ["--times", "40,50"], r"--times asks for 40 to 50 seconds"),
-    (lambda given: None, ["--frames", "500"], r"--frames asks for 500"),
     (lambda given: None, ["--crop", "9000x10+0+0"], r"lies outside of camera 02, which has"),
     (lambda given: None, ["--crop", "all of it"], r"--crop says 'all of it', expected WIDTHxHEIGHT\+LEFT\+TOP"),
     (lambda given: None, ["--crop", "09=10x10+0+0"], r"--crop names camera '09', have 02, 03, 04"),
@@ -191,15 +182,12 @@ def test_one_sentence_and_nothing_written_over(
     spoil(given)
     before = {path: path.read_bytes() for path in given.folder.rglob("*") if path.is_file()}
     folder = tmp_path / "recording"
-    command = ["import", str(given.videos), "--calibration", str(given.calibration), "--output", str(folder)]
-    code = main([*command, "--exposure", "false", *words])
+    code = main(importing(given, folder, *words))
     said = capsys.readouterr().err
     sentences = [line for line in said.splitlines() if line.startswith("d2: ")]
     assert code == 2, said
     assert len(sentences) == 1
     assert "fault of d2-4dgs" not in said
-    import re
-
     assert re.search(says, sentences[0]), sentences[0]
     assert {path: path.read_bytes() for path in given.folder.rglob("*") if path.is_file()} == before
     assert not (folder / "cameras.json").exists()
@@ -208,34 +196,30 @@ def test_one_sentence_and_nothing_written_over(
 def test_another_import_and_another_folder_are_not_written_over(
     given: Filmed, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    folder = tmp_path / "recording"
-    command = ["import", str(given.videos), "--calibration", str(given.calibration), "--output", str(folder)]
-    command += ["--exposure", "false", "--scale", "0.3", "--offsets", "none"]
-    assert main([*command, "--frames", "0:1"]) == 0
+    folder, small = tmp_path / "recording", ("--scale", "0.3", "--offsets", "none", "--frames")
+    assert main(importing(given, folder, *small, "500")) == 2
+    assert "--frames asks for 500" in capsys.readouterr().err
+    assert main(importing(given, folder, *small, "0:4:2")) == 0, "what was refused leaves nothing in the way of advice"
+    recording = open_recording(folder)
+    assert recording.rate == pytest.approx(recording.fps / 2)
     before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-    assert main([*command, "--frames", "0:2"]) == 2
+    assert main(importing(given, folder, *small, "0:2")) == 2
     assert "holds another import, made with other frames: give another --output" in capsys.readouterr().err
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
-    refused = [*command[:-4], "--offsets", "none", "--scale", "0.3"]
-    refused[5] = str(tmp_path / "later")
-    assert main([*refused, "--frames", "500"]) == 2
-    assert main([*refused, "--frames", "0:4:2"]) == 0, "a refused import leaves nothing that blocks its own advice"
-    later = open_recording(tmp_path / "later")
-    assert later.rate == pytest.approx(later.fps / 2)
-    capsys.readouterr()
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.txt").write_text("mine")
-    assert main([*command[:5], str(tmp_path / "mine"), "--frames", "0:1"][:6]) == 2
+    assert main(importing(given, tmp_path / "mine")) == 2
     assert "is not empty and holds no import" in capsys.readouterr().err
     assert [path.name for path in (tmp_path / "mine").iterdir()] == ["thesis.txt"]
 
 
 def test_who_knows_better_imports_all_the_same(given: Filmed, tmp_path: Path, capsys) -> None:
     of_another_rig(given)
-    words = ["import", str(given.videos), "--calibration", str(given.calibration), "--output", str(tmp_path / "c")]
-    words += ["--exposure", "false", "--offsets", "none", "--frames", "0:1", "--images", "videos"]
+    words = importing(given, tmp_path / "c", "--offsets", "none", "--frames", "0:1", "--images", "videos")
     assert main(words) == 2
-    assert "or give --accept-calibration" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "does not fit the videos: " in said
+    assert "or give --accept-calibration" in said
     assert main([*words, "--accept-calibration"]) == 0
     assert any("misses features" in note for note in open_recording(tmp_path / "c").notes)
 
@@ -243,8 +227,7 @@ def test_who_knows_better_imports_all_the_same(given: Filmed, tmp_path: Path, ca
 def test_one_video_of_another_event(room: Recording, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The same room, another take: sound of its own, and things that move at other times."""
     take = video(room, tmp_path / "one", {name: Shooting() for name in NAMES}, sound=True, sounds={"04": 99})
-    words = ["import", str(take.videos), "--calibration", str(take.calibration), "--output", str(tmp_path / "c")]
-    assert main([*words, "--offsets", "sound"]) == 2
+    assert main(importing(take, tmp_path / "c", "--offsets", "sound")) == 2
     said = capsys.readouterr().err
     assert "nothing in the sound links 04 with 02, 03: leave camera 04 out, give the offsets" in said
 
@@ -252,8 +235,7 @@ def test_one_video_of_another_event(room: Recording, tmp_path: Path, capsys: pyt
 def test_timecode_against_sound(room: Recording, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     shots = {name: Shooting(timecode="01:00:00:00") for name in NAMES}
     take = video(room, tmp_path / "one", {**shots, "04": Shooting(timecode="01:00:00:09")}, sound=True)
-    words = ["import", str(take.videos), "--calibration", str(take.calibration), "--output", str(tmp_path / "c")]
-    assert main(words) == 2
+    assert main(importing(take, tmp_path / "c")) == 2
     assert "sound and timecode contradict each other" in capsys.readouterr().err
 
 
@@ -267,13 +249,12 @@ def test_a_folder_of_videos_is_no_recording_yet(
 
 def test_a_video_that_moved_since_it_was_imported(given: Filmed, tmp_path: Path, capsys) -> None:
     folder = tmp_path / "lazy"
-    words = ["import", str(given.videos), "--calibration", str(given.calibration), "--output", str(folder)]
-    assert main([*words, "--exposure", "false", "--offsets", "none", "--images", "videos"]) == 0
+    words = ("--offsets", "none", "--images", "videos", "--frames", "0:1")
+    assert main(importing(given, folder, *words)) == 0
     (given.videos / "03.mp4").rename(tmp_path / "elsewhere.mp4")
     assert main(["plan", str(folder), "--train-cameras", "all"]) == 2
     assert "the video of camera 03 is not at" in capsys.readouterr().err
-    short = select_frames(replace(open_recording(folder, cameras=["02"]), frames=(0, 1)), (0, 1))
-    assert len(short.frames) == 2
+    assert open_recording(folder, cameras=["02"]).image("02", 0).shape == (136, 240, 3)
 
 
 def test_a_calibration_folder_is_not_searched_without_end(
@@ -283,7 +264,6 @@ def test_a_calibration_folder_is_not_searched_without_end(
     (tmp_path / "home").mkdir()
     for number in range(6):
         (tmp_path / "home" / f"{number}.txt").write_text("")
-    words = ["import", str(given.videos), "--calibration", str(tmp_path / "home"), "--output", str(tmp_path / "out")]
-    assert main(words) == 2
+    assert main(importing(replace(given, calibration=tmp_path / "home"), tmp_path / "out")) == 2
     assert "home holds more than 5 files, which is no calibration" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -54,6 +52,22 @@ def imported(filmed: Filmed) -> Path:
     return folder
 
 
+@pytest.fixture(scope="module")
+def lazy(filmed: Filmed) -> tuple[Path, list[tuple[str, int]]]:
+    """The same import whose images stay in the videos, and every frame of a camera that it decoded."""
+    asked: list[tuple[str, int]] = []
+    frame_of = Decoder._frame
+
+    def counted(self: Decoder, index: int) -> object:
+        asked.append((self.video.path.stem, index))
+        return frame_of(self, index)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Decoder, "_frame", counted)
+        import_videos(settings_of(filmed, filmed.folder / "lazy", images="videos"))
+    return filmed.folder / "lazy", asked
+
+
 def settings_of(filmed: Filmed, folder: Path, **more: object) -> ImportSettings:
     return ImportSettings(videos=(filmed.videos,), calibration=filmed.calibration, output=folder, **more)
 
@@ -93,30 +107,50 @@ def test_gains_are_within_one_percent_of_what_was_applied(filmed: Filmed, import
     assert np.abs(measured - (applied - applied.mean(0))).max() < 0.01
 
 
-def test_a_stopped_import_goes_on_and_a_finished_one_is_read(filmed: Filmed, imported: Path, monkeypatch) -> None:
-    clocks, images = imported / "import" / "clocks.json", sorted((imported / "images").rglob("*.png"))
-    before = {path: path.read_bytes() for path in (clocks, imported / "cameras.json", *images)}
-    times = {path: path.stat().st_mtime_ns for path in images}
-    (imported / "cameras.json").unlink()
-    images[3].unlink()
-    monkeypatch.setattr("d2_plugin.recordings.importing.clocks.read_sound", lambda path: pytest.fail("found again"))
-    import_videos(settings_of(filmed, imported))
-    assert {path: path.read_bytes() for path in before} == before
-    assert [path for path in images if path.stat().st_mtime_ns != times[path]] == [images[3]]
-
-
-def test_images_that_stay_in_the_videos_are_the_same(filmed: Filmed, imported: Path, tmp_path: Path) -> None:
-    given = tuple(f"{n}={c['seconds'] * FPS}" for n, c in read_table(imported / "import" / "clocks.json", KIND).items())
-    import_videos(settings_of(filmed, tmp_path / "lazy", images="videos", offsets=given, exposure=False))
-    lazy, written = open_recording(tmp_path / "lazy"), open_recording(imported)
-    assert lazy.layout == "videos"
-    assert not list((tmp_path / "lazy").rglob("*.png"))
-    assert lazy.frames == written.frames
+def test_images_that_stay_in_the_videos_are_the_same(lazy: tuple, imported: Path) -> None:
+    opened, written = open_recording(lazy[0]), open_recording(imported)
+    assert opened.layout == "videos"
+    assert not list(lazy[0].rglob("*.png"))
+    assert opened.frames == written.frames
     for name in NAMES:
         for frame in (written.frames[3], written.frames[0]):
-            assert (lazy.image(name, frame) == written.image(name, frame)).all()
-    some = select_frames(select_cameras(lazy, ["03"]), written.frames[:2])
+            assert (opened.image(name, frame) == written.image(name, frame)).all()
+    some = select_frames(select_cameras(opened, ["03"]), written.frames[:2])
     assert some.seconds(written.frames[1], "03") == pytest.approx(written.seconds(written.frames[1], "03"), abs=1e-4)
+
+
+def test_what_is_checked_is_decoded_once(lazy: tuple) -> None:
+    """Sound is the clock and nothing is written: one look at the calibration, then each moment once."""
+    asked = lazy[1]
+    assert len(asked) <= (1 + MOMENTS) * len(NAMES)
+    assert max(map(asked.count, asked)) <= 2
+
+
+def test_the_commands_and_a_stopped_import_goes_on(
+    filmed: Filmed, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "c"
+    words = ["import", str(filmed.videos), "--calibration", str(filmed.calibration), "--output", str(folder)]
+    words += ["--scale", "0.5", "--times", "0,0.2", "--offsets", "sound"]
+    assert main(words) == 0
+    said = capsys.readouterr().out
+    assert "start in frames, by sound: 01 +0.00, 02 -7.5" in said
+    assert "4 cameras, 5 frames at 24 per second, 160x90 pixels" in said
+    assert main(["plan", str(folder), "--train-cameras", "all"]) == 0
+    said = capsys.readouterr().out
+    assert "4 training cameras, " in said
+    assert "cameras expose up to 0." in said
+    files = [folder / "import" / "clocks.json", folder / "cameras.json", *(folder / "images").rglob("*.png")]
+    before = {path: (path.read_bytes(), path.stat().st_mtime_ns) for path in files}
+    (folder / "cameras.json").unlink()
+    lost = folder / "images" / "02" / "00003.png"
+    lost.unlink()
+    for measured in ("clocks.read_sound", "importing.measured_exposures"):
+        monkeypatch.setattr(f"d2_plugin.recordings.importing.{measured}", lambda *_: pytest.fail("found again"))
+    assert main(words) == 0
+    assert {path: path.read_bytes() for path in files} == {path: data for path, (data, _) in before.items()}
+    written = [path for path in files if path.suffix == ".png" and path.stat().st_mtime_ns != before[path][1]]
+    assert written == [lost]
 
 
 def test_crop_and_scale_move_the_camera_with_the_image(filmed: Filmed, imported: Path, tmp_path: Path) -> None:
@@ -139,48 +173,3 @@ def test_margins_of_undistorted_images_are_not_valid() -> None:
     assert valid.shape == (40, 50)
     assert valid[20, 25]
     assert not valid[0, 0]
-
-
-def test_motion_alone_is_within_half_a_frame(plaza: Recording, tmp_path: Path) -> None:
-    shootings = {name: replace(SHOOTINGS[name], offset=frames / FPS) for name, frames in zip(NAMES, (0, 3, -5, 6))}
-    videos = video(plaza, tmp_path, shootings)
-    _, clocks = import_videos(settings_of(videos, tmp_path / "recording", exposure=False, images="videos"))
-    for name, shot in shootings.items():
-        assert clocks[name].method == "motion"
-        assert abs(clocks[name].seconds - shot.offset) * FPS < 0.5
-
-
-def test_the_commands(filmed: Filmed, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    words = ["import", str(filmed.videos), "--calibration", str(filmed.calibration), "--output", str(tmp_path / "c")]
-    assert main([*words, "--scale", "0.5", "--times", "0,0.2", "--offsets", "sound", "--exposure", "false"]) == 0
-    said = capsys.readouterr().out
-    assert "start in frames, by sound: 01 +0.00, 02 -7.5" in said
-    assert "4 cameras, 5 frames at 24 per second, 160x90 pixels" in said
-    assert main(["plan", str(tmp_path / "c"), "--train-cameras", "all"]) == 0
-    said = capsys.readouterr().out
-    assert "leave out  monocular    no maps on disk and no network" in said
-    assert "4 training cameras, " in said
-    assert "degrees apart" in said
-    assert "cameras expose up to 0." in said
-
-
-def test_the_exposures_that_were_measured_are_kept(imported: Path) -> None:
-    recording = open_recording(imported)
-    table = json.loads((imported / "cameras.json").read_text())
-    assert set(table["exposures"]) == set(NAMES)
-    assert recording.exposures["02"].gain == tuple(table["exposures"]["02"]["gain"])
-
-
-def test_what_is_checked_is_decoded_once(filmed: Filmed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Sound is the clock and nothing is written: one look at the calibration, then each moment once."""
-    asked: list[tuple[str, int]] = []
-    frame_of = Decoder._frame
-
-    def counted(self: Decoder, index: int) -> object:
-        asked.append((self.video.path.stem, index))
-        return frame_of(self, index)
-
-    monkeypatch.setattr(Decoder, "_frame", counted)
-    import_videos(settings_of(filmed, tmp_path / "out", images="videos"))
-    assert len(asked) <= (1 + MOMENTS) * len(NAMES)
-    assert max(map(asked.count, asked)) <= 2

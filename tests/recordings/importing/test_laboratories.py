@@ -29,6 +29,7 @@ from d2_plugin.recordings.synthetic.raycast import Room, Scene, Solid, render_co
 av = pytest.importorskip("av")
 
 MOMENTS = 5  # images of each webcam
+STARTED = (0, 3, -2, 1.5)  # frames by which the mouse's cameras started after the first
 
 
 def write_avi(path: Path, images: Sequence[np.ndarray], rate: int, tag: str = "XVID") -> None:
@@ -120,7 +121,10 @@ def test_xvid_at_wide_angles_is_imported_and_a_turned_camera_named(
 
 @pytest.fixture(scope="module")
 def mouse(tmp_path_factory: pytest.TempPathFactory) -> Filmed:
-    """Four small cameras above an arena of 60 cm with bare walls, and their calibration in millimetres."""
+    """Four small cameras above an arena of 60 cm with bare walls, and their calibration in millimetres.
+
+    They started by `STARTED` frames after the first.
+    """
     folder, rng = tmp_path_factory.mktemp("mouse"), np.random.default_rng(0)
     (folder / "videos").mkdir()
     bare = plaster(rng)
@@ -139,7 +143,7 @@ def mouse(tmp_path_factory: pytest.TempPathFactory) -> Filmed:
         R = np.stack([right, np.cross(forward, right), forward])
         K = pinhole(150.0, 150.0, 100.5, 80.5)
         camera = Camera(f"cam_{number}", 200, 160, K, rigid(R, -R @ centre))
-        images = [render_color(scene, camera, i / 30) for i in range(16)]
+        images = [render_color(scene, camera, (i + STARTED[number]) / 30) for i in range(16)]
         write_avi(folder / "videos" / f"{camera.name}.avi", images, 30)
         half = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
         known.append(Known(camera.name, (200, 160), K - half, (0.0,) * 5, R, -R @ centre * 1000))
@@ -151,6 +155,10 @@ def test_a_mouse_among_four_small_cameras(mouse: Filmed, tmp_path: Path, refused
     words += ["--output", str(tmp_path / "c")]
     assert "up to 480 apart, which is no metres: say what it is with --unit mm" in refused(*words)
     assert main([*words, "--unit", "mm"]) == 0
-    for name, clock in read_table(tmp_path / "c" / "import" / "clocks.json", KIND).items():
-        assert abs(clock["seconds"]) <= 2 * clock["error"] + 1e-9, name
+    clocks = read_table(tmp_path / "c" / "import" / "clocks.json", KIND)
+    for started, (name, clock) in zip(STARTED, clocks.items(), strict=True):
+        assert clock["method"] == "motion"
+        off = abs(clock["seconds"] - started / 30)
+        assert off <= 2 * clock["error"] + 1e-9, name
+        assert off < 0.5 / 30, name
     assert rig_width(open_recording(tmp_path / "c").cameras.values()) == pytest.approx(0.48, abs=0.01)

@@ -16,7 +16,7 @@ from d2_plugin.recordings.cameras.camera import CalibratedCamera, pinhole
 from d2_plugin.recordings.cameras.lens import Lens
 from d2_plugin.recordings.importing.source import Cut, VideosSource
 from d2_plugin.recordings.importing.steady import steadiness
-from d2_plugin.recordings.importing.video import Decoder, VideoFile, read_video
+from d2_plugin.recordings.importing.video import Decoder, read_video
 from d2_plugin.recordings.recording import Recording, Source
 from d2_plugin.recordings.selection import spread
 
@@ -52,13 +52,6 @@ def test_time_stamps_are_those_of_the_container(unsteady: tuple[Path, np.ndarray
     assert not video.sound
 
 
-def test_a_table_keeps_everything(unsteady: tuple[Path, np.ndarray]) -> None:
-    video = read_video(unsteady[0])
-    again = VideoFile.from_dict(video.as_dict())
-    assert again.as_dict() == video.as_dict()
-    assert (again.times == video.times).all()
-
-
 def test_frames_in_any_order_are_the_same(unsteady: tuple[Path, np.ndarray]) -> None:
     decoder, truth = Decoder(read_video(unsteady[0])), images(40)
     for index in (0, 1, 39, 5, 6, 38, 0):
@@ -68,18 +61,17 @@ def test_frames_in_any_order_are_the_same(unsteady: tuple[Path, np.ndarray]) -> 
     assert all((decoder.image(index) == kept[index]).all() for index in (17, 3, 29))
 
 
-@pytest.mark.parametrize(("gop", "decoded"), [(150, 121), (30, 40)])
 def test_no_frame_is_decoded_that_a_key_frame_makes_needless_nor_twice(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, gop: int, decoded: int
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Moments far apart, in a video with one key frame, and in one with several."""
-    path = write_video(tmp_path / "a.mp4", images(64)[:50] * 3, list(np.arange(150) / 30), gop=gop)
+    """Moments far apart, in a video with several key frames."""
+    path = write_video(tmp_path / "a.mp4", images(50) * 3, list(np.arange(150) / 30), gop=30)
     placed, place = [], Decoder._place
     monkeypatch.setattr(Decoder, "_place", lambda self, frame: placed.append(place(self, frame)) or placed[-1])
     decoder = Decoder(read_video(path))
     for index in (0, 60, 65, 120):
         decoder.image(index)
-    assert len(placed) == len(set(placed)) <= decoded
+    assert len(placed) == len(set(placed)) <= 40
     assert placed == sorted(placed)
 
 
@@ -128,11 +120,8 @@ def test_hdr_becomes_what_other_cameras_show(tmp_path: Path) -> None:
     names = "colorprim=bt2020:transfer=smpte2084:colormatrix=bt2020nc"
     with av.open(str(tmp_path / "a.mp4"), "w") as container:
         stream = container.add_stream("libx264", rate=25)
-        stream.height, stream.width, stream.pix_fmt, stream.options = (
-            *SIZE,
-            "yuv420p",
-            {"x264-params": names, "crf": "1"},
-        )
+        stream.height, stream.width, stream.pix_fmt = *SIZE, "yuv420p"
+        stream.options = {"x264-params": names, "crf": "1"}
         for _ in range(3):
             frame = av.VideoFrame(SIZE[1], SIZE[0], "yuv420p")
             for plane, code in zip(frame.planes, (143, 128, 128), strict=True):  # 203 candela in PQ, of 16 to 235
@@ -191,7 +180,7 @@ class Bumped(Source):
         return cv2.warpPerspective(image, turn, image.shape[1::-1]) if frame >= self.first else image
 
 
-@pytest.mark.parametrize(("name", "camera"), [("studio", "02"), ("plaza", "05"), ("dome", "03")])
+@pytest.mark.parametrize(("name", "camera"), [("studio", "02"), ("dome", "03")])
 def test_a_camera_that_is_bumped_by_half_a_degree_is_noticed_though_people_walk(
     shared_data: Callable[[str], Path], name: str, camera: str
 ) -> None:

@@ -10,36 +10,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from oracles.export_files import (
-    ReadPage,
-    covariances_from,
-    covariances_of,
-    read_still_ply,
-)
+from oracles.export_files import ReadPage, covariances_from, covariances_of, read_still_ply
 from viewing.export.scenes import DURATION, make_scene, sharp_model
 
 from d2_plugin.backbones.yang4d import Yang4D, Yang4DSettings
 from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.moving import Harmonics, LinearMotion, MovingGaussians
 from d2_plugin.gaussians.slicing import slice_gaussians
-from d2_plugin.viewing.checkpoints import read_ply
 from d2_plugin.viewing.export.coded import encode, seen_rows
 from d2_plugin.viewing.export.export import Export, write_export
 from d2_plugin.viewing.export.keys import STILL, bake, cholesky, morton_order, state_at
 from d2_plugin.viewing.export.page import to_json, write_page
-from d2_plugin.viewing.export.ply import scales_and_rotations, write_ply
 from d2_plugin.viewing.export.scene import ExportScene
 
 TIMES = (0.0, 0.13, 0.5)
-
-
-def harmonic_scene(count: int = 300) -> MovingGaussians:
-    """Still Gaussians with harmonics of degree 3."""
-    still, _ = make_scene(sharp_model("yang4d", count)).still_at(0.2)
-    generator = torch.Generator().manual_seed(4)
-    more = 0.3 * torch.randn(len(still), 15, 3, generator=generator).double()
-    coefficients = torch.cat([still.harmonics.coefficients.clamp(-3, 3), more.clamp(-0.9, 0.9)], 1)
-    return MovingGaussians(still.positions, still.covariances, still.opacities, Harmonics(coefficients, 3))
 
 
 def with_harmonics(count: int) -> Yang4D:
@@ -179,15 +163,12 @@ class TestOthersReadIt:
         [path], notes = write_export([scene], Export((Path(),), "4dgs"), tmp_path)
         assert "checks the file against its own error bounds" in notes[0]
         read = fourdgs.read(str(path)).gaussians
-        parts = [
-            torch.from_numpy(np.asarray(part, np.float64)) for part in (read.positions, read.scales, read.rotations)
-        ]
-        shape = covariances_from(parts[1], parts[2][:, [3, 0, 1, 2]])
-        colors = torch.from_numpy(read.colors.astype(np.float64))
-        motion = LinearMotion(
-            *(torch.from_numpy(p.astype(np.float64)) for p in (read.motions, read.mu_t, read.sigma_t))
+        names = ("positions", "scales", "rotations", "colors", "motions", "mu_t", "sigma_t")
+        positions, scales, rotations, colors, *motion = (
+            torch.from_numpy(np.asarray(getattr(read, name), np.float64)) for name in names
         )
-        found = MovingGaussians(parts[0], shape, colors[:, 3], Harmonics(colors[:, None, :3], 0), motion)
+        shape, harmonics = covariances_from(scales, rotations[:, [3, 0, 1, 2]]), Harmonics(colors[:, None, :3], 0)
+        found = MovingGaussians(positions, shape, colors[:, 3], harmonics, LinearMotion(*motion))
         shown = scene.moving.select(seen_rows(scene.moving, DURATION))
         assert len(found) == len(shown)
         for time in TIMES:  # in another order: by their places
@@ -246,15 +227,3 @@ class TestOthersReadIt:
         monkeypatch.setenv("PATH", str(tmp_path))
         with pytest.raises(D2Error, match="npm install -g @playcanvas/splat-transform"):
             write_export([make_scene(sharp_model("yang4d", 50))], Export((Path(),), "sog", frames=(0,)), tmp_path)
-
-
-class TestStills:
-    def test_ply_frames_hold_harmonics_where_viewers_look(self, tmp_path: Path) -> None:
-        still, path = harmonic_scene(), tmp_path / "a.ply"
-        c, kept = still.harmonics.coefficients, still.opacities >= 1 / 255
-        write_ply(path, still, scales_and_rotations(still.covariances))
-        green = read_ply(path)["f_rest_15"].double()  # of the first coefficient above the constant one
-        torch.testing.assert_close(green, c[kept, 1, 1], rtol=1e-6, atol=0)
-        read = read_still_ply(path)
-        torch.testing.assert_close(read.harmonics.coefficients, c[kept], rtol=1e-5, atol=1e-6)
-        torch.testing.assert_close(read.covariances, still.covariances[kept], rtol=1e-4, atol=1e-9)

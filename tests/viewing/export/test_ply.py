@@ -76,6 +76,18 @@ def test_a_viewer_reads_back_the_gaussians(tmp_path: Path) -> None:
     assert (np.abs(rebuilt - matrices.numpy()) / size).max() < 2e-6
 
 
+def test_harmonics_lie_where_viewers_look(tmp_path: Path) -> None:
+    """After the constant one all coefficients of red, then of green, then of blue."""
+    means, covariances, _, _, _ = gaussians(5)
+    coefficients = torch.randn(5, 16, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    still = MovingGaussians(means.double(), covariances, torch.full((5,), 0.5).double(), Harmonics(coefficients, 3))
+    write_ply(tmp_path / "a.ply", still, scales_and_rotations(covariances))
+    _, rows = read_ply(tmp_path / "a.ply")
+    for place in range(45):
+        expected = coefficients[:, 1 + place % 15, place // 15].numpy()
+        np.testing.assert_allclose(rows[f"f_rest_{place}"], expected, rtol=1e-6)
+
+
 def test_what_no_rasterizer_draws_is_left_out(tmp_path: Path) -> None:
     means, covariances, colors, _, _ = gaussians(6)
     opacities = torch.tensor([0.5, 1 / 254, 1 / 256, 0.0, 1.0, 0.5])
