@@ -1,0 +1,158 @@
+"""A hostile user on the command line: each case is one sentence and exit code 2, never silence or a traceback."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from d2_plugin.commands.cli import main
+from d2_plugin.recordings.export.folder import described
+from d2_plugin.recordings.synthetic.room import synthetic_recording
+
+pytest.importorskip("av")
+pytest.importorskip("cv2")
+pytestmark = pytest.mark.slow
+
+Change = Callable[[Path], object]
+Words = list[str]
+Refused = Callable[..., str]
+
+FLAGS = """
+--densify.scale -1 | --densify.opacity 2 | --densify.budget-per-view -5 | --densify.budget -5
+--depth-loss.tau-v nan | --depth-loss.weight 1e308 | --prune.patience 0 | --d2.views-per-evaluation -3
+--d2.finite-every -1 | --d2.finite-every 1.5 | --plan.temporal maybe | --seed -1 | --seed 99999999999999999999999
+--frames 0:3000000000 | --frames x | --frames 3:1 | --iterations 0 | --iterations 1e400 | --iterations nan
+--downscale 0 | --downscale 1e9 | --hooks all,none | --hooks densfy | --device tpu | --backbone ../x
+--priors.stereo.depth-range 1,2,3 | --backbone.densify.every -1 | --config /dev/null | --config /nope
+--train-cameras a,b | --train-cameras train0,train0 | --test-cameras train0 | --mono-onnx /nope | --mono-kind purple
+--output /proc/x/y | --output /dev/null/x
+"""
+IMPORTS = """
+--times 5,1 | --times 0,1e300 | --times nan,1 | --times 1 | --times 100,200 | --frames 0:3000000000 | --frames 0:11:0
+--rate nan | --rate 0 | --rate 1e-300 | --scale 0 | --scale 1e-9 | --scale nan | --crop 0x0+0+0 | --crop 9x9 --crop zz
+--crop 999999x999999+0+0 | --crop zz=10x10+0+0 | --crop 10x10+95+0 | --images gif | --unit mile
+--offsets zz=1 | --offsets train0=1e300 | --offsets train0=nan | --offsets train0 | --offsets train0=x
+--offsets timecode | --offsets sound | --exposure maybe | --output /dev/null/x | --calibration /dev/zero
+--calibration /nope | --calibration /
+"""
+VIDEOS = """
+--path nope | --path /nope.json | --path /dev/zero | --degrees 0 --path orbit | --show nope | --show truth --path orbit
+--cameras nope | --at 1e300 | --at nan | --at -1 | --speed 0 | --speed 1e-300 | --speed nan | --seconds 1e300
+--seconds 0 | --fps 1e300 | --fps 1e-300 | --fps nan | --width 0 | --width 99999 | --downscale 0 | --quality 99
+--output /dev/null/x.mp4 | --output /proc/x.mp4 | --format mkv
+"""
+ELSEWHERE = """
+view /nope | view /dev/null | view RUN --port 0 | view RUN --host 999.1.1.1 | view RUN --height 1 | doctor /nope
+doctor /dev/null | doctor VIDEOS | doctor --attach nope | doctor --attach fudan | doctor --attach fudan /nope
+export RUN --format nope | export RUN --frames 0:1 | export RUN --megabytes 0 | export RUN --output /dev/null/x
+export /nope | export VIDEOS | eval /nope | eval /dev/null | compare | compare /nope | report /nope | report /dev/zero
+render | render /nope | render /dev/null | render VIDEOS | bench | bench nope | bench training | bench training x
+bench training /nope@a+b | bench training ROOM@train0+train1 --seconds nan | bench training ROOM@train0@@x
+bench training ROOM@train0+train1 --jobs 9999999 | bench training ROOM@train0+train1 --config /nope --steps 1
+bench training-step --gaussians 1000000000000 | bench training-step --sizes 0x0 | bench training-step --sizes x
+bench training-step --sizes 99999x99999 | bench training-step --threads 1000000000000 | bench gpu --steps nope
+bench training-step --frames 1000000000000 | bench training-step --seconds nan | bench gpu --output /dev/null/x
+stability --sweeps nope | demo --iterations 0 | demo --output /dev/null/x
+export-recording ROOM --format nope --output x | ablate ROOM --train-cameras train0,train1 --rows nope --output x
+ export-recording ROOM --format n3dv --output ROOM
+"""
+
+
+def lines(text: str) -> list[Words]:
+    return [case.split() for line in text.strip().splitlines() for case in line.split(" | ")]
+
+
+def train(recording: Path, output: Path, *more: str) -> Words:
+    words = ["train", str(recording), "--train-cameras", "train0,train1", "--iterations", "3"]
+    return [*words, "--output", str(output), *more]
+
+
+def imported(place: Path, videos: Path, output: Path) -> Words:
+    words = ["import", str(videos), "--calibration", str(place / "cameras.json"), "--output", str(output)]
+    return [*words, "--offsets", "none"]
+
+
+@pytest.fixture(scope="module")
+def place(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """videos/ with a video of each camera and cameras.json, a filmed `room` and a trained `run`."""
+    from recorded import write_video
+
+    folder = tmp_path_factory.mktemp("newer")
+    filmed = synthetic_recording(cameras=2, held_out=0, frames=12, width=96, height=54, arc_degrees=15)
+    (folder / "videos").mkdir()
+    for name in filmed.cameras:
+        images = [filmed.image(name, frame) for frame in filmed.frames]
+        write_video(folder / "videos" / f"{name}.mp4", images, [frame / filmed.fps for frame in filmed.frames])
+    (folder / "cameras.json").write_text(json.dumps(described(filmed)))
+    shutil.copytree(recording, folder / "room")
+    words = ["train", str(folder / "room"), "--train-cameras", "train0,train1", "--iterations", "3", "--hooks", "none"]
+    assert main([*words, "--output", str(folder / "run")]) == 0
+    return folder
+
+
+def test_flags(recording: Path, tmp_path: Path, refused: Refused) -> None:
+    begin = train(recording, tmp_path / "run")
+    for words in lines(FLAGS):
+        refused(*begin, *words)
+
+
+def test_imports(place: Path, tmp_path: Path, refused: Refused) -> None:
+    begin = imported(place, place / "videos", tmp_path / "out")
+    for words in lines(IMPORTS):
+        refused(*begin, *words)
+
+
+def test_videos(place: Path, tmp_path: Path, refused: Refused) -> None:
+    begin = ["render", str(place / "run"), "--output", str(tmp_path / "a.mp4")]
+    for words in lines(VIDEOS):
+        refused(*begin, *words)
+    assert not list(tmp_path.iterdir())
+
+
+def test_other_commands(place: Path, refused: Refused, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(place)
+    named = {"RUN": "run", "VIDEOS": "videos", "ROOM": "room"}
+    for words in lines(ELSEWHERE):
+        refused(*(named.get(word, word).replace("ROOM@", "room@") for word in words))
+
+
+def in_its_place(make: Callable[[Path], object]) -> Change:
+    """Something else in the place of a file."""
+
+    def change(path: Path) -> None:
+        path.unlink()
+        make(path)
+
+    return change
+
+
+DAMAGES: tuple[Change, ...] = (
+    lambda path: path.write_bytes(b""),
+    lambda path: path.write_bytes(bytes(range(256)) * 9),
+    lambda path: path.write_bytes(path.read_bytes()[: path.stat().st_size // 2]),
+    in_its_place(os.mkfifo),
+    in_its_place(Path.mkdir),
+    in_its_place(lambda path: path.symlink_to("/nope")),
+    in_its_place(lambda path: path.symlink_to("/dev/zero")),
+)
+
+
+def test_damaged_videos(place: Path, tmp_path: Path, refused: Refused) -> None:
+    for number, damage in enumerate(DAMAGES):
+        videos = shutil.copytree(place / "videos", tmp_path / str(number))
+        damage(videos / "train0.mp4")
+        refused(*imported(place, videos, tmp_path / f"out{number}"))
+
+
+@pytest.mark.parametrize("name", ["run.json", "checkpoint.pt"])
+def test_damaged_runs(place: Path, name: str, tmp_path: Path, refused: Refused) -> None:
+    for number, damage in enumerate(DAMAGES):
+        run = shutil.copytree(place / "run", tmp_path / str(number))
+        damage(run / name)
+        for words in (["eval", run], ["export", run], ["render", run, "--output", tmp_path / "a.mp4"]):
+            refused(*words)
