@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import importlib.util
 import os
+import shutil
 import signal
 import sys
 from collections.abc import Iterator
@@ -21,18 +23,14 @@ from d2_plugin.errors import D2Error, MissingExtra
 from d2_plugin.priors.build import PriorSummary, build_priors
 from d2_plugin.priors.construct import NO_MAP, SCALE_UNKNOWN
 from d2_plugin.priors.dask_build import build_priors_on_cluster
-from d2_plugin.priors.frame import Frame
-from d2_plugin.priors.geometric_source import GeometricSource
 from d2_plugin.priors.monocular.align import align
 from d2_plugin.priors.settings import PriorSettings, StereoSettings
 from d2_plugin.priors.stereo import matched_depth
-from d2_plugin.priors.stereo.depth_range import DepthBounds
-from d2_plugin.priors.stereo.filtering.filter import GeometricDepth
 from d2_plugin.priors.stereo.reuse import RADIUS, changed
 from d2_plugin.protocol import Label
 from d2_plugin.recordings import open_recording
 from d2_plugin.recordings.export.folder import save_recording
-from d2_plugin.recordings.recording import Camera, Recording
+from d2_plugin.recordings.recording import Recording
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.store.store import PriorStore
 
@@ -54,6 +52,12 @@ def built(plain: Recording, tmp_path_factory: pytest.TempPathFactory) -> tuple[P
     """A finished store that tests may read but not change."""
     path = tmp_path_factory.mktemp("built") / "priors"
     return path, build_priors(plain, NAMES, path, SETTINGS)
+
+
+@pytest.fixture
+def begun(built: tuple[Path, PriorSummary], tmp_path: Path) -> Path:
+    """A copy of that store, for tests that go on with it: its stereo is not matched again."""
+    return Path(shutil.copytree(built[0], tmp_path / "begun"))
 
 
 def lying(plain: Recording) -> Recording:
@@ -151,6 +155,24 @@ def test_a_second_build_computes_nothing_and_changes_nothing(
 
 
 @pytest.mark.parametrize(
+    ("change", "again"),
+    [
+        ({"max_pixels": 10_000}, True),
+        ({"seed": 1}, True),
+        ({"reuse_block": 7}, False),
+        ({"patchmatch_device": "cpu"}, False),
+    ],
+)
+def test_views_are_matched_again_where_a_setting_changed_that_matches_depend_on(
+    plain: Recording, begun: Path, monkeypatch: pytest.MonkeyPatch, change: dict[str, object], again: bool
+) -> None:
+    no_stereo(monkeypatch)
+    settings = replace(SETTINGS, stereo=replace(SETTINGS.stereo, **change))
+    with pytest.raises(AssertionError) if again else contextlib.nullcontext():
+        build_priors(plain, NAMES, begun, settings)
+
+
+@pytest.mark.parametrize(
     ("strict", "loose"),
     [
         ({"uncertainty": False}, {"uncertainty": False, "tau_c": 0.5}),
@@ -158,48 +180,43 @@ def test_a_second_build_computes_nothing_and_changes_nothing(
     ],
 )
 def test_other_fusion_settings_reuse_the_stereo_cache(
-    plain: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, strict: dict, loose: dict
+    plain: Recording, begun: Path, monkeypatch: pytest.MonkeyPatch, strict: dict, loose: dict
 ) -> None:
-    strict = build_priors(plain, NAMES, tmp_path, replace(SETTINGS, agreement=0.0, **strict))
     no_stereo(monkeypatch)
-    loose = build_priors(plain, NAMES, tmp_path, replace(SETTINGS, agreement=0.0, **loose))
+    strict = build_priors(plain, NAMES, begun, replace(SETTINGS, agreement=0.0, **strict))
+    loose = build_priors(plain, NAMES, begun, replace(SETTINGS, agreement=0.0, **loose))
     assert loose.built == 6
     assert loose.shares["train0"]["verified"] > strict.shares["train0"]["verified"]
     assert loose.shares["train0"]["mono"] == strict.shares["train0"]["mono"]
 
 
-def test_a_changed_image_rebuilds_its_timestamp_and_no_other(plain: Recording, tmp_path: Path) -> None:
+def test_a_changed_image_rebuilds_its_timestamp_and_no_other(plain: Recording, begun: Path) -> None:
     def image(camera: str, frame: int) -> np.ndarray:
         image = plain.image(camera, frame)
         return np.minimum(image, 250) + 5 if (camera, frame) == ("train1", 1) else image
 
-    build_priors(plain, NAMES, tmp_path, SETTINGS)
-    summary = build_priors(showing(plain, {"image": image}), NAMES, tmp_path, SETTINGS)
+    summary = build_priors(showing(plain, {"image": image}), NAMES, begun, SETTINGS)
     assert (summary.built, summary.kept) == (3, 3)
 
 
-def test_a_damaged_prior_is_rebuilt_and_named(
-    plain: Recording, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    build_priors(plain, NAMES, tmp_path, SETTINGS)
-    intact = contents(tmp_path)
-    file = tmp_path / "priors" / "train2" / "00001.npy"
+def test_a_damaged_prior_is_rebuilt_and_named(plain: Recording, begun: Path, caplog: pytest.LogCaptureFixture) -> None:
+    intact = contents(begun / "priors")
+    file = begun / "priors" / "train2" / "00001.npy"
     file.write_bytes(file.read_bytes()[:-100])
-    (tmp_path / "cache" / "stereo" / "train0" / "00001.npy").write_bytes(b"garbage")
-    (tmp_path / "cache" / "stereo" / "train1" / "00001.json").write_bytes(b"")  # as a power cut leaves it
-    summary = build_priors(plain, NAMES, tmp_path, SETTINGS)
+    (begun / "cache" / "stereo" / "train0" / "00001.npy").write_bytes(b"garbage")
+    (begun / "cache" / "stereo" / "train1" / "00001.json").write_bytes(b"")  # as a power cut leaves it
+    summary = build_priors(plain, NAMES, begun, SETTINGS)
     assert (summary.built, summary.kept) == (1, 5)
     assert str(file) in caplog.text
-    assert contents(tmp_path / "priors") == {
-        name.removeprefix("priors/"): data for name, data in intact.items() if name.startswith("priors/")
-    }
+    assert contents(begun / "priors") == intact
 
 
-def test_a_refused_map_leaves_stereo_as_it_is(plain: Recording, tmp_path: Path) -> None:
-    summary = build_priors(lying(plain), NAMES, tmp_path / "refused", SETTINGS)
+def test_a_refused_map_leaves_stereo_as_it_is(plain: Recording, begun: Path, tmp_path: Path) -> None:
+    shutil.copytree(begun, tmp_path / "stereo")
+    summary = build_priors(lying(plain), NAMES, begun, SETTINGS)
     assert {(camera, frame) for camera, frame, _ in summary.refused} == {("train0", 1), ("train2", 0)}
     build_priors(plain, NAMES, tmp_path / "stereo", replace(SETTINGS, variant="mvs"))
-    refused, stereo = PriorStore.open(tmp_path / "refused"), PriorStore.open(tmp_path / "stereo")
+    refused, stereo = PriorStore.open(begun), PriorStore.open(tmp_path / "stereo")
     for view in (("train0", 1), ("train2", 0)):
         found, expected = refused.prior(*view), stereo.prior(*view)
         assert found.verified.any()
@@ -209,16 +226,15 @@ def test_a_refused_map_leaves_stereo_as_it_is(plain: Recording, tmp_path: Path) 
     assert refused.record("train2", 0)["refused"] == NO_MAP
 
 
-@pytest.mark.parametrize("settings", [PriorSettings(uncertainty=False), PriorSettings.paper()])
 def test_in_the_paper_a_refused_view_is_empty_with_its_reason_and_the_others_are_not(
-    plain: Recording, tmp_path: Path, settings: PriorSettings
+    plain: Recording, begun: Path
 ) -> None:
-    summary = build_priors(lying(plain), NAMES, tmp_path, replace(settings, stereo=SETTINGS.stereo))
+    summary = build_priors(lying(plain), NAMES, begun, PriorSettings.paper(stereo=SETTINGS.stereo))
     assert summary.built == 6
     refused = {(camera, frame) for camera, frame, _ in summary.refused}
     assert refused >= {("train0", 1), ("train2", 0)}
     assert len(refused) < 6
-    store = PriorStore.open(tmp_path)
+    store = PriorStore.open(begun)
     for view in refused:
         assert not store.prior(*view).support.any()
         assert not torch.isfinite(store.prior(*view).sigma).any()
@@ -228,12 +244,10 @@ def test_in_the_paper_a_refused_view_is_empty_with_its_reason_and_the_others_are
     assert "refused 1x (train0/1)" in str(summary)
 
 
-def test_without_monocular_depth_geometric_depth_stands_alone_and_that_is_said(
-    plain: Recording, tmp_path: Path
-) -> None:
-    summary = build_priors(replace(plain, mono_kind=None), NAMES, tmp_path, SETTINGS)
+def test_without_monocular_depth_geometric_depth_stands_alone_and_that_is_said(plain: Recording, begun: Path) -> None:
+    summary = build_priors(replace(plain, mono_kind=None), NAMES, begun, SETTINGS)
     assert "without a second source" in str(summary)
-    store = PriorStore.open(tmp_path)
+    store = PriorStore.open(begun)
     assert store.record("train0", 0)["variant"] == "mvs"
     assert set(np.unique(store.prior("train0", 0).labels)) == {Label.EMPTY, Label.VERIFIED}
 
@@ -260,12 +274,15 @@ def test_no_source_at_all_is_an_error(plain: Recording, tmp_path: Path) -> None:
     assert not (tmp_path / "p").exists()
 
 
-def test_the_papers_preset_is_the_papers_equations_and_nothing_else(plain: Recording, tmp_path: Path) -> None:
+def test_the_papers_preset_is_the_papers_equations_and_nothing_else(
+    plain: Recording, begun: Path, tmp_path: Path
+) -> None:
     """One line fitted to the anchors, e < tau_c, D^g where verified, the aligned map where alone, no evidence."""
     settings = PriorSettings.paper(stereo=SETTINGS.stereo)
-    build_priors(plain, NAMES, tmp_path / "dual", settings)
+    shutil.copytree(begun, tmp_path / "mvs")
+    build_priors(plain, NAMES, begun, settings)
     build_priors(plain, NAMES, tmp_path / "mvs", replace(settings, variant="mvs"))
-    dual, mvs = PriorStore.open(tmp_path / "dual"), PriorStore.open(tmp_path / "mvs")
+    dual, mvs = PriorStore.open(begun), PriorStore.open(tmp_path / "mvs")
     accepted = 0
     for name in NAMES:
         found, mono, geometric = dual.prior(name, 0), plain.mono(name, 0), mvs.prior(name, 0).depth.numpy()
@@ -289,7 +306,9 @@ def test_the_papers_preset_is_the_papers_equations_and_nothing_else(plain: Recor
     assert accepted
 
 
-def test_a_network_is_asked_once_per_image(plain: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_network_is_asked_once_per_image(
+    plain: Recording, begun: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     pytest.importorskip("onnxruntime")
     from d2_plugin.priors.monocular.network import MonocularModel
 
@@ -298,9 +317,9 @@ def test_a_network_is_asked_once_per_image(plain: Recording, tmp_path: Path, mon
     monkeypatch.setattr(MonocularModel, "predict", lambda self, image: asked.append(1) or original(self, image))
     network = tiny_onnx.mean_network(tmp_path / "net.onnx", 45, 80)
     settings = replace(SETTINGS, mono_onnx=str(network), mono_kind="relative")
-    build_priors(plain, NAMES, tmp_path / "priors", settings)
+    build_priors(plain, NAMES, begun, settings)
     assert len(asked) == 6
-    build_priors(plain, NAMES, tmp_path / "priors", replace(settings, tau_c=0.3))
+    build_priors(plain, NAMES, begun, replace(settings, tau_c=0.3))
     assert len(asked) == 6
     with pytest.raises(D2Error, match="mono_kind = relative"):
         build_priors(plain, NAMES, tmp_path / "other", replace(settings, mono_kind=None))
@@ -342,10 +361,6 @@ def still_built(still: Recording, tmp_path_factory: pytest.TempPathFactory) -> P
     return path
 
 
-def priors_of(path: Path) -> dict[str, bytes]:
-    return {str(file.relative_to(path)): file.read_bytes() for file in sorted((path / "priors").rglob("*.*"))}
-
-
 def test_a_change_is_what_outlasts_noise_and_its_neighbourhood_changes_with_it() -> None:
     rng = np.random.default_rng(0)
     before = np.full((60, 80), 100, np.uint8)
@@ -358,16 +373,13 @@ def test_a_change_is_what_outlasts_noise_and_its_neighbourhood_changes_with_it()
     assert not mask[:15].any()
 
 
-def test_the_share_that_was_matched_is_recorded_and_small(still_built: Path) -> None:
-    store = PriorStore.open(still_built)
-    shares = [store.record("train0", frame)["stereo"]["matched_share"] for frame in range(5)]
-    assert shares[0] == shares[3] == 1  # blocks of three
-    assert max(shares[1], shares[2], shares[4]) < 0.4
-
-
-def test_carrying_over_does_not_change_what_is_verified_by_much(
+def test_what_is_carried_over_is_not_matched_and_does_not_change_what_is_verified_by_much(
     still: Recording, still_built: Path, tmp_path: Path
 ) -> None:
+    store = PriorStore.open(still_built)
+    shares = [store.record("train0", frame)["stereo"]["matched_share"] for frame in still.frames]
+    assert shares[0] == shares[3] == 1  # blocks of three
+    assert max(shares[1], shares[2], shares[4]) < 0.4
     full = replace(REUSE, stereo=replace(STEREO, reuse_static=False))
     build_priors(still, STILL_NAMES, tmp_path, full)
     results = {}
@@ -399,12 +411,10 @@ def test_a_build_that_stopped_within_a_block_goes_on_to_the_same_store(
     with pytest.raises(Stopped):
         build_priors(still, STILL_NAMES, tmp_path, REUSE, progress=stop)
     build_priors(still, STILL_NAMES, tmp_path, REUSE)
-    assert priors_of(tmp_path) == priors_of(still_built)
+    assert contents(tmp_path / "priors") == contents(still_built / "priors")
 
 
-DASK_NAMES = ["train0", "train1"]
-
-DASK = PriorSettings(stereo=StereoSettings(matcher="patchmatch", reuse_block=2))
+DASK = PriorSettings(stereo=replace(STEREO, reuse_block=2))
 
 needs_dask = pytest.mark.skipif(
     importlib.util.find_spec("distributed") is None, reason="dask.distributed is not installed"
@@ -414,17 +424,9 @@ pytestmark = pytest.mark.filterwarnings("default")  # distributed deprecates its
 
 
 @pytest.fixture(scope="module")
-def shared_room(tmp_path_factory: pytest.TempPathFactory) -> Recording:
-    rendered = synthetic_recording(cameras=2, held_out=0, frames=6, width=128, height=72, arc_degrees=10)
-    return open_recording(save_recording(rendered, tmp_path_factory.mktemp("recording") / "room"))
-
-
-@pytest.fixture(scope="module")
-def alone(shared_room: Recording, tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, bytes], PriorSummary]:
-    """What one process builds."""
-    path = tmp_path_factory.mktemp("alone") / "priors"
-    summary = build_priors(shared_room, DASK_NAMES, path, DASK)
-    return contents(path), summary
+def shared_room(still: Recording, tmp_path_factory: pytest.TempPathFactory) -> Recording:
+    """On disk, where other processes can read it."""
+    return open_recording(save_recording(still, tmp_path_factory.mktemp("recording") / "room"))
 
 
 @pytest.fixture(scope="module")
@@ -442,8 +444,9 @@ def worker_pids(cluster: object) -> list[int]:
 
 @needs_dask
 def test_a_worker_killed_in_the_middle_changes_no_byte_of_the_store(
-    shared_room: Recording, alone: tuple, two_workers: object, tmp_path: Path
+    shared_room: Recording, two_workers: object, tmp_path: Path
 ) -> None:
+    alone = build_priors(shared_room, STILL_NAMES, tmp_path / "alone", DASK)
     before, killed, seen = worker_pids(two_workers), [], []
 
     def kill_one(done: int, total: int, note: str) -> None:
@@ -454,17 +457,17 @@ def test_a_worker_killed_in_the_middle_changes_no_byte_of_the_store(
 
     store = tmp_path / "priors"
     summary = build_priors_on_cluster(
-        shared_room, DASK_NAMES, store, DASK, scheduler=two_workers.scheduler_address, progress=kill_one
+        shared_room, STILL_NAMES, store, DASK, scheduler=two_workers.scheduler_address, progress=kill_one
     )
     assert killed
     assert killed[0] not in worker_pids(two_workers)
-    assert seen[0][0] < 12
-    assert seen[-1] == (12, 12)
-    assert contents(store) == alone[0]
-    assert summary.built + summary.kept == 12
+    assert seen[0][0] < 10
+    assert seen[-1] == (10, 10)
+    assert contents(store) == contents(tmp_path / "alone")
+    assert summary.built + summary.kept == 10
     assert summary.kept <= 2 * DASK.stereo.reuse_block  # of the part that was begun twice
-    for camera in DASK_NAMES:
-        assert summary.shares[camera] == pytest.approx(alone[1].shares[camera])
+    for camera in STILL_NAMES:
+        assert summary.shares[camera] == pytest.approx(alone.shares[camera])
 
 
 @needs_dask
@@ -476,50 +479,12 @@ def test_what_a_single_build_refuses_the_cluster_refuses_in_the_same_words(
     client = importlib.import_module("distributed").Client
     monkeypatch.setattr("distributed.Client", lambda at, timeout, **more: client(at, timeout="0.2s", **more))
     with pytest.raises(D2Error, match="no dask scheduler answers at tcp://127.0.0.1:1 "):
-        build_priors_on_cluster(shared_room, DASK_NAMES, tmp_path / "p", DASK, scheduler="tcp://127.0.0.1:1")
+        build_priors_on_cluster(shared_room, STILL_NAMES, tmp_path / "p", DASK, scheduler="tcp://127.0.0.1:1")
     with pytest.raises(D2Error, match="give at least 1"):
-        build_priors_on_cluster(shared_room, DASK_NAMES, tmp_path / "p", DASK, workers=0)
+        build_priors_on_cluster(shared_room, STILL_NAMES, tmp_path / "p", DASK, workers=0)
 
 
-def test_without_dask_its_extra_is_named(
-    shared_room: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_dask_its_extra_is_named(still: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(MissingExtra, match=r"dask.distributed, which is not installed: .*d2-4dgs\[cluster\]"):
-        build_priors_on_cluster(shared_room, DASK_NAMES, tmp_path / "p", DASK)
-
-
-CAMERAS = [Camera(name, 7, 5, np.eye(3), np.eye(4)) for name in ("a", "b")]
-
-FRAME = Frame(3, {}, {"a": "image a", "b": "image b"})
-
-BOUNDS = DepthBounds(1e-3, 1e6, "test")
-
-
-class Keyed(GeometricSource):
-    """Depth whose key alone is asked for."""
-
-    def _inputs(self, frame: Frame) -> None:
-        return None
-
-    def _computed(self, frame: Frame) -> list[GeometricDepth]:
-        return []
-
-
-@pytest.mark.parametrize(
-    ("change", "voids"),
-    [
-        ({"max_pixels": 10_000}, {"patchmatch"}),
-        ({"seed": 1}, {"patchmatch"}),
-        ({"reuse_block": 7}, set()),
-        ({"patchmatch_device": "cpu"}, set()),
-    ],
-)
-def test_maps_are_made_anew_where_a_setting_changed_that_they_depend_on_and_kept_elsewhere(
-    tmp_path: Path, change: dict[str, object], voids: set[str]
-) -> None:
-    settings = replace(StereoSettings(), **change)
-    for matcher in ("patchmatch", "workspace"):
-        sources = (Keyed(CAMERAS, BOUNDS, chosen, matcher, tmp_path) for chosen in (StereoSettings(), settings))
-        key, other = (source.key(FRAME) for source in sources)
-        assert (key != other) == (matcher in voids), matcher
+        build_priors_on_cluster(still, STILL_NAMES, tmp_path / "p", DASK)

@@ -48,17 +48,12 @@ def depth_errors(recording: Recording, names: list[str], points: SparsePoints, f
     return errors
 
 
-@pytest.mark.parametrize("names", [["train0", "train1", "train2", "train3"], ["train1", "train2"]])
-def test_points_lie_on_the_true_surfaces(recording: Recording, names: list[str]) -> None:
-    points = points_of(recording, names)
+def test_points_of_two_views_lie_on_the_true_surfaces_and_carry_their_colour(recording: Recording) -> None:
+    points = points_of(recording, ["train1", "train2"])
     assert len(points) > 100
-    errors = depth_errors(recording, names, points)
+    errors = depth_errors(recording, ["train1", "train2"], points)
     assert np.median(errors) < 0.005
     assert np.mean(errors < 0.05) > 0.9
-
-
-def test_points_carry_the_colour_of_their_surface(recording: Recording) -> None:
-    points = points_of(recording, ["train1", "train2"])
     camera, image = recording.cameras["train1"], recording.image("train1", 0) / 255
     in_camera = points.positions @ camera.T_camera_world[:3, :3].T + camera.T_camera_world[:3, 3]
     pixels = in_camera @ camera.K.T
@@ -103,15 +98,11 @@ def test_a_pycolmap_that_is_missing_or_old_names_its_extra(found: object, needed
         triangulate([], [])
 
 
-@pytest.mark.parametrize("order", [("colmap", "torch"), ("torch", "colmap")], ids=" first, ".join)
-def test_compression_survives_pycolmap_and_the_process_ends_silently_at_sigterm(order: tuple[str, str]) -> None:
+def test_compression_survives_pycolmap_and_the_process_ends_silently_at_sigterm() -> None:
     """Its own zlib, imported before the system's, makes compression abort; its logging answers SIGTERM with a trace."""
-    imports = {
-        "torch": "import torch",
-        "colmap": "from d2_plugin.extras import import_pycolmap; import_pycolmap('a test', 'stereo')",
-    }
+    imports = "from d2_plugin.extras import import_pycolmap; import_pycolmap('a test', 'stereo')"
     ends = "zlib.compress(bytes(10**5)); print('alive', flush=True); os.kill(os.getpid(), signal.SIGTERM)"
-    code = "\n".join([*(imports[name] for name in order), "import os, signal, zlib", ends])
+    code = "\n".join([imports, "import os, signal, zlib", ends])
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
     assert (done.returncode, done.stdout, done.stderr) == (-signal.SIGTERM, "alive\n", "")
 

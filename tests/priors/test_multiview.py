@@ -60,12 +60,17 @@ def without(room: Recording, tmp_path_factory: pytest.TempPathFactory) -> PriorS
 
 
 @pytest.fixture(scope="module")
-def good(room: Recording, maps: Path, tmp_path_factory: pytest.TempPathFactory) -> PriorStore:
+def good(room: Recording, without: PriorStore, maps: Path, tmp_path_factory: pytest.TempPathFactory) -> PriorStore:
     """The prior of stereo, monocular maps and these."""
-    return build(room, tmp_path_factory.mktemp("good"), SETTINGS, maps)
+    return build(room, tmp_path_factory.mktemp("good") / "prior", SETTINGS, maps, without)
 
 
-def build(room: Recording, path: Path, settings: PriorSettings, maps: Path) -> PriorStore:
+def build(
+    room: Recording, path: Path, settings: PriorSettings, maps: Path, begun: PriorStore | None = None
+) -> PriorStore:
+    """A store of its own; the views are not matched again where another one is `begun`."""
+    if begun is not None:
+        shutil.copytree(begun.path, path)
     build_priors(room, NAMES, path, replace(settings, multiview=str(maps)))
     return PriorStore.open(path)
 
@@ -200,13 +205,12 @@ def test_confidence_counts_by_how_errors_follow_it_in_any_unit(unit: float, powe
 def test_a_good_source_makes_what_stereo_does_not_know_nearer_to_the_truth_and_declares_it(
     room: Recording, good: PriorStore, without: PriorStore
 ) -> None:
-    store = good
     unmeasured = Label.MONO, Label.AGREED
-    assert median_error(room, store, *unmeasured) < 0.7 * median_error(room, without, *unmeasured)
-    record = store.record("train0", 1)
+    assert median_error(room, good, *unmeasured) < 0.7 * median_error(room, without, *unmeasured)
+    record = good.record("train0", 1)
     assert record["multiview"]["alignment"]["status"] == "ok"
     assert record["multiview"]["alignment"]["scale"] == pytest.approx(1, abs=0.1), "poses and what stands still gave it"
-    for label, errors in held_against_truth(store, room).labels.items():
+    for label, errors in held_against_truth(good, room).labels.items():
         assert errors.share < 0.05 or (errors.within > 0.55 and errors.within_two > 0.85), label
 
 
@@ -235,15 +239,12 @@ def spoilt_confidence(arrays: dict[str, np.ndarray], frame: int) -> None:
     arrays["conf"][:] = 0
 
 
-def spoilt_sky(arrays: dict[str, np.ndarray], frame: int) -> None:
-    arrays["depth"][:] = np.inf
-
-
-@pytest.mark.parametrize("spoilt", [spoilt_noise, spoilt_views, spoilt_confidence, spoilt_sky])
+@pytest.mark.parametrize("spoilt", [spoilt_noise, spoilt_views, spoilt_confidence])
 def test_a_source_that_shows_nothing_leaves_the_prior_as_it_is_or_nearly(
     room: Recording, without: PriorStore, tmp_path: Path, spoilt: Callable
 ) -> None:
-    store = build(room, tmp_path / "prior", SETTINGS, write_multiview(room, NAMES, tmp_path / "maps", turned=spoilt))
+    maps = write_multiview(room, NAMES, tmp_path / "maps", turned=spoilt)
+    store = build(room, tmp_path / "prior", SETTINGS, maps, without)
     found, expected = (
         np.stack([each.prior(name, 1).labels.numpy() for name in NAMES]) == Label.VERIFIED for each in (store, without)
     )
@@ -252,11 +253,11 @@ def test_a_source_that_shows_nothing_leaves_the_prior_as_it_is_or_nearly(
     assert median_error(room, store, *every) < 1.03 * median_error(room, without, *every)
 
 
-@pytest.mark.parametrize("moved_on", [0, 1, 2])
+@pytest.mark.parametrize("moved_on", [0, 1])
 def test_maps_of_other_instants_say_nothing_of_what_moves(
     tmp_path: Path, moved_on: int, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Files with the numbers of other frames, here the next or the one after: their still part is used alone."""
+    """Files with the numbers of other frames, here the next: their still part is used alone."""
     long = synthetic_recording(cameras=3, held_out=0, frames=5, width=96, height=54, fps=1.0)
     maps = write_multiview(long, NAMES, tmp_path / "right")
     renamed = tmp_path / "renamed"
@@ -290,7 +291,7 @@ def test_where_nothing_moves_nothing_is_held_against_the_maps() -> None:
 
 @pytest.mark.parametrize("factor", [1e-6, 1e6])
 def test_the_unit_of_the_depth_changes_nothing(
-    room: Recording, good: PriorStore, tmp_path: Path, factor: float
+    room: Recording, good: PriorStore, without: PriorStore, tmp_path: Path, factor: float
 ) -> None:
     """Nor does that of the poses, nor of the confidence."""
 
@@ -299,7 +300,8 @@ def test_the_unit_of_the_depth_changes_nothing(
         arrays["conf"] *= np.float32(factor)
         arrays["extrinsics"][..., 3] *= np.float32(factor)
 
-    other = build(room, tmp_path / "prior", SETTINGS, write_multiview(room, NAMES, tmp_path / "maps", turned=scaled))
+    maps = write_multiview(room, NAMES, tmp_path / "maps", turned=scaled)
+    other = build(room, tmp_path / "prior", SETTINGS, maps, without)
     for name in NAMES:
         one, two = (store.prior(name, 1) for store in (good, other))
         same = (one.labels == two.labels).numpy()
@@ -331,10 +333,11 @@ def test_stereo_of_one_thing_does_not_scale_an_instant_and_that_of_the_scene_doe
             assert [each.alignment.scale for each in found.values()] == pytest.approx([scale] * 3, rel=1e-5)
 
 
-def test_only_what_changed_is_built_again(room: Recording, tmp_path: Path) -> None:
+def test_only_what_changed_is_built_again(room: Recording, without: PriorStore, tmp_path: Path) -> None:
     """Of metric maps; the scale of others depends on the instants at which it is measured."""
     settings = replace(SETTINGS, multiview_scale="metric")
-    store = build(room, tmp_path / "prior", settings, write_multiview(room, NAMES, tmp_path / "maps", posed=True))
+    maps = write_multiview(room, NAMES, tmp_path / "maps", posed=True)
+    store = build(room, tmp_path / "prior", settings, maps, without)
     before = contents(store.path)
 
     def changed(arrays: dict[str, np.ndarray], frame: int) -> None:
@@ -352,7 +355,7 @@ def test_a_frame_that_the_network_did_not_see_has_the_prior_of_the_other_sources
 ) -> None:
     maps = write_multiview(room, NAMES, tmp_path / "maps")
     (maps / "00001.npz").unlink()
-    store = build(room, tmp_path / "prior", SETTINGS, maps)
+    store = build(room, tmp_path / "prior", SETTINGS, maps, without)
     for one, two in zip(store.prior("train1", 1)[:4], without.prior("train1", 1)[:4], strict=True):
         np.testing.assert_array_equal(one.numpy(), two.numpy())
 

@@ -17,6 +17,7 @@ from d2_plugin.compiler import NoCompiler, load_library, nvrtc
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.settings import StereoSettings
 from d2_plugin.priors.stereo import patchmatch_cuda as gpu
+from d2_plugin.priors.stereo import patchmatch_kernel
 from d2_plugin.priors.stereo.geometric_depth import gray
 from d2_plugin.priors.stereo.patchmatch import patchmatch
 from d2_plugin.priors.stereo.patchmatch_cuda import PROGRAM, Call, flags_for
@@ -26,7 +27,6 @@ from d2_plugin.recordings.recording import Camera
 
 HERE = Path(__file__).parent
 SETTINGS = StereoSettings()
-CPU = replace(SETTINGS, patchmatch_device="cpu")
 
 
 class ShimDriver:
@@ -186,13 +186,10 @@ def test_nvrtc_compiles_the_kernels_without_a_toolkit(
     assert b"d2_patchmatch_update" in binary.code
 
 
-def test_as_many_sources_as_there_may_be_are_refused_by_number_of_pixels(rig: Rig) -> None:
+def test_as_many_sources_as_there_may_be_are_refused_by_number_of_pixels(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Places in all sources together are 32-bit integers."""
-    from d2_plugin.priors.stereo import patchmatch_kernel
-
-    limit = patchmatch_kernel.MOST_PIXELS
-    assert limit == 2**31 - 1
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(patchmatch_kernel, "MOST_PIXELS", 1000)
-        with pytest.raises(D2Error, match="pixels together, at most 1000 are possible: lower max_pixels"):
-            patchmatch(grays(rig), rig.cameras, rig.depth_range, CPU)
+    monkeypatch.setattr(patchmatch_kernel, "MOST_PIXELS", 1000)
+    with pytest.raises(D2Error, match="pixels together, at most 1000 are possible: lower max_pixels"):
+        patchmatch(grays(rig), rig.cameras, rig.depth_range, replace(SETTINGS, patchmatch_device="cpu"))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -96,38 +97,35 @@ def test_sigma_above_one_is_infinite_and_only_an_exact_zero_is_zero() -> None:
     np.testing.assert_array_equal(every, SIGMA)
 
 
-@pytest.mark.parametrize("bad", [np.nan, -0.1])
-def test_sigma_that_is_no_standard_deviation_is_refused(store: PriorStore, bad: float) -> None:
+def with_pixel(map_: str, value: float) -> FusedPrior:
+    """One pixel of one map holds something else."""
     prior = some_prior(1)
-    prior.sigma[2, 3] = bad
-    with pytest.raises(D2Error, match="camera a, frame 0 has a sigma that is no map"):
-        store.write("a", 0, prior, {})
-    with pytest.raises(D2Error, match="has a sigma that is no map"):
-        store.write("a", 0, replace(prior, sigma=prior.sigma[1:]), {})
+    getattr(prior, map_)[2, 3] = value
+    return prior
 
 
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -1.0])
-def test_depth_that_is_no_depth_is_refused(store: PriorStore, bad: float) -> None:
-    prior = some_prior(1)
-    prior.depth[2, 3] = bad
-    before = array_file(store).read_bytes()
-    with pytest.raises(D2Error, match="camera a, frame 0 has 1 depths that are NaN, infinite or negative"):
+@pytest.mark.parametrize(
+    ("prior", "message"),
+    [
+        (with_pixel("sigma", np.nan), "camera a, frame 0 has a sigma that is no map"),
+        (with_pixel("sigma", -0.1), "has a sigma that is no map"),
+        (replace(some_prior(), sigma=some_prior().sigma[1:]), "has a sigma that is no map"),
+        (with_pixel("depth", np.nan), "camera a, frame 0 has 1 depths that are NaN, infinite or negative"),
+        (with_pixel("depth", np.inf), "has 1 depths that are NaN, infinite or negative"),
+        (with_pixel("depth", -1.0), "has 1 depths that are NaN, infinite or negative"),
+        (replace(some_prior(), labels=np.full(SHAPE, Label.CONFLICT, np.uint8)), "contradict its depth"),
+        (with_pixel("labels", 9), "label 9"),
+        (replace(some_prior(), colors=IMAGE[:5]), "build the prior at the image's size"),
+        (replace(some_prior(), colors=None), "its colours none"),
+    ],
+)
+def test_maps_that_are_no_prior_are_refused_and_change_nothing(
+    store: PriorStore, prior: FusedPrior, message: str
+) -> None:
+    before = contents(store.path)
+    with pytest.raises(D2Error, match=message):
         store.write("a", 0, prior, {})
-    assert array_file(store).read_bytes() == before
-
-
-def test_labels_that_contradict_depth_are_refused(store: PriorStore) -> None:
-    prior = some_prior()
-    prior.labels[prior.depth > 0] = Label.CONFLICT
-    with pytest.raises(D2Error, match="contradict its depth"):
-        store.write("a", 0, prior, {})
-    prior.labels[0, 0] = 9
-    with pytest.raises(D2Error, match="label 9"):
-        store.write("a", 0, prior, {})
-    with pytest.raises(D2Error, match="build the prior at the image's size"):
-        store.write("a", 0, replace(some_prior(), colors=IMAGE[:5]), {})
-    with pytest.raises(D2Error, match="its colours none"):
-        store.write("a", 0, replace(some_prior(), colors=None), {})
+    assert contents(store.path) == before
 
 
 @pytest.mark.parametrize(
@@ -174,6 +172,8 @@ def test_what_is_damaged_can_be_read_around_while_it_is_built_again(store: Prior
 
 
 def test_an_array_whose_record_was_not_written_yet_does_not_exist(store: PriorStore) -> None:
+    assert store.is_current("a", 0, "k")
+    assert not store.is_current("a", 0, "other")
     array_file(store).with_suffix(".json").unlink()
     assert PriorStore.open(store.path).prior("a", 0) is None
     assert not store.is_current("a", 0, "k")
@@ -184,11 +184,6 @@ def test_an_array_replaced_without_its_record_is_not_trusted(store: PriorStore) 
     store.write("a", 0, some_prior(5), {"key": "k2"})
     array_file(store).with_suffix(".json").write_text(record)  # as a kill between the two writes leaves it
     assert not store.is_current("a", 0, "k")
-
-
-def test_another_key_is_another_prior(store: PriorStore) -> None:
-    assert store.is_current("a", 0, "k")
-    assert not store.is_current("a", 0, "other")
 
 
 def test_stores_of_other_recordings_formats_and_other_folders_are_refused(store: PriorStore, tmp_path: Path) -> None:
@@ -228,6 +223,19 @@ def recording() -> Recording:
     return room()
 
 
+@pytest.fixture(scope="module")
+def finished(recording: Recording, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("finished") / "store"
+    built(recording, path)
+    return path
+
+
+@pytest.fixture
+def copied(finished: Path, tmp_path: Path) -> Path:
+    """A finished store of three cameras, for a test that may change it."""
+    return Path(shutil.copytree(finished, tmp_path / "store"))
+
+
 def built(recording: Recording, folder: Path, names: list[str] = NAMES) -> PriorSummary:
     return build_priors(recording, names, folder, SETTINGS)
 
@@ -240,9 +248,8 @@ def moved(recording: Recording, name: str) -> Recording:
 
 
 @pytest.mark.parametrize("other", ["images", "a pose", "a size", "a rig"])
-def test_another_recording_of_the_same_name_changes_no_byte(recording: Recording, tmp_path: Path, other: str) -> None:
-    built(recording, tmp_path)
-    before = contents(tmp_path)
+def test_another_recording_of_the_same_name_changes_no_byte(recording: Recording, copied: Path, other: str) -> None:
+    before = contents(copied)
     others = {
         "images": lambda: room(seed=5),
         "a pose": lambda: moved(recording, "train1"),
@@ -250,17 +257,16 @@ def test_another_recording_of_the_same_name_changes_no_byte(recording: Recording
         "a rig": lambda: room(arc_degrees=30),
     }
     with pytest.raises(D2Error, match=r"holds the priors of \S+, not of .*\(.*\): choose another output folder"):
-        built(others[other](), tmp_path)
-    assert contents(tmp_path) == before
+        built(others[other](), copied)
+    assert contents(copied) == before
 
 
-def test_a_new_name_and_another_order_of_the_cameras_change_no_file(recording: Recording, tmp_path: Path) -> None:
-    built(recording, tmp_path)
-    before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*") if path.is_file()}
+def test_a_new_name_and_another_order_of_the_cameras_change_no_file(recording: Recording, copied: Path) -> None:
+    before = {path: path.stat().st_mtime_ns for path in copied.rglob("*") if path.is_file()}
     for same, names in ((recording, NAMES), (replace(recording, name="other"), NAMES), (recording, NAMES[::-1])):
-        summary = built(same, tmp_path, names)
+        summary = built(same, copied, names)
         assert (summary.built, summary.kept) == (0, 6)
-    assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*") if path.is_file()} == before
+    assert {path: path.stat().st_mtime_ns for path in copied.rglob("*") if path.is_file()} == before
 
 
 @pytest.mark.parametrize("first", [NAMES, ["train0", "train2"]], ids=["fewer", "more"])

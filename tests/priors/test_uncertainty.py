@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from d2_plugin.priors.fuse import FusedPrior, fuse
-from d2_plugin.priors.monocular import correct
 from d2_plugin.priors.monocular.align import align, aligned_depth
 from d2_plugin.priors.monocular.correct import corrected_depth, corrected_without
 from d2_plugin.priors.monocular.extrapolation import extrapolation_error
@@ -133,9 +132,8 @@ def test_a_confidence_spreads_sigma_and_does_not_change_what_errors_say_of_its_s
     assert np.isinf(monocular_uncertainty(scene.aligned, scene.anchors, SETTINGS, half).sigma[:, :118]).all()
 
 
-@pytest.mark.parametrize("unit", [1e-3, 1e6])
-def test_the_unit_of_the_world_does_not_matter(scenes: list[Scene], unit: float) -> None:
-    scene = scenes[0]
+def test_the_unit_of_the_world_does_not_matter(scenes: list[Scene]) -> None:
+    scene, unit = scenes[0], 1e6
     found = monocular_uncertainty((scene.aligned * unit).astype(np.float32), scene.anchors * np.float32(unit), SETTINGS)
     expected = monocular_uncertainty(scene.aligned, scene.anchors, SETTINGS)
     # The corrected map is float32, and its logarithm near 14 exact to 1e-6: small spans of it are differences of those.
@@ -346,15 +344,6 @@ def test_a_smooth_bend_is_undone() -> None:
     corrected = corrected_depth(aligned, geometric, SETTINGS)
     assert corrected.dtype == np.float32
     assert np.median(error_of(corrected, depth)) < 0.15 * np.median(error_of(aligned, depth))
-
-
-def test_pixels_without_anchors_nearby_keep_the_global_fit(monkeypatch: pytest.MonkeyPatch) -> None:
-    depth, aligned, geometric = anchored_scene()
-    geometric[:, 40:] = 0
-    monkeypatch.setattr(correct, "SCALES", (0.03,))
-    corrected = corrected_depth(aligned, geometric, SETTINGS)
-    np.testing.assert_allclose(corrected[:, 80:], aligned[:, 80:], rtol=1e-4)
-    assert np.median(error_of(corrected, depth)[:, :35]) < 0.4 * np.median(error_of(aligned, depth)[:, :35])
 
 
 def test_a_patch_of_wrong_anchors_stays_in_conflict() -> None:
