@@ -23,7 +23,7 @@ from d2_plugin.attach import launch
 from d2_plugin.attach.launch import main
 from d2_plugin.attach.packages import provide
 from d2_plugin.attach.recipes import RECIPES, recipe
-from d2_plugin.attach.session import Original, Session
+from d2_plugin.attach.session import AddGradient, Original, Session
 from d2_plugin.config import DensifyConfig, DepthLossConfig, PruneConfig
 from d2_plugin.hooks.reports import Report, RunLog
 
@@ -132,6 +132,15 @@ class TestSession:
         assert session._drawn == 0
         render(scene.train_cameras[1.0][0], gaussians, [0, 0, 0])
         assert session._drawn == 1
+
+
+def test_the_image_passes_unchanged_and_the_term_gets_its_weight() -> None:
+    image, x = torch.rand(3, 2, 2, requires_grad=True), torch.tensor(2.0, requires_grad=True)
+    out = AddGradient.apply(image, x**2, 0.25)
+    assert torch.equal(out, image)
+    (3 * out).sum().backward()
+    assert torch.equal(image.grad, torch.full_like(image, 3.0))
+    assert x.grad == 0.25 * 4
 
 
 def test_stages_of_4dgaussians_reach_the_adapter() -> None:
