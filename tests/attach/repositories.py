@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Sequence
 from functools import partial
 from types import ModuleType, SimpleNamespace
@@ -20,7 +21,7 @@ from mimics import (
     spacetime,
     swift4d,
 )
-from mimics.inria import default_options
+from mimics.inria import default_options, kept
 from tiny import make_views
 from torch import Tensor
 
@@ -257,15 +258,9 @@ def snapshot(outcome: SimpleNamespace) -> dict[str, Tensor]:
 
 def saved(name: str, first: SimpleNamespace) -> object:
     """What a checkpoint has to hold for a run to go on; some repositories save less."""
-    if name == "fastergs4d":
-        return first.trainer.capture()
-    if name in ("gsplat", "gsplat_dynamic"):
-        moments = {key: optimizer.state_dict() for key, optimizer in first.optimizers.items()}
-        if name == "gsplat":
-            return snapshot(first), moments, first.strategy_state
-        nets = first.hexplane.state_dict(), first.deform_net.state_dict()
-        return snapshot(first), moments, first.state, nets, first.hex_optimizer.state_dict()
-    params = first.gaussians.capture()
-    if name == "deformable3d":
-        return params, first.deform.deform.state_dict(), first.deform.optimizer.state_dict()
-    return params
+    if name == "gsplat":
+        return copy.deepcopy((first.splats, first.optimizers, first.strategy_state))
+    if name == "gsplat_dynamic":
+        nets = first.hexplane, first.deform_net, first.hex_optimizer
+        return copy.deepcopy((first.params, first.optimizers, first.state, *nets))
+    return (kept(first.gaussians), kept(first.deform)) if name == "deformable3d" else kept(first.gaussians)

@@ -4,26 +4,23 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 import torch
-from mimics import deformable3d, ex4dgs, fudan, hust4d, spacetime
+from mimics import deformable3d, fudan, hust4d, spacetime
 from mimics.inria import cameras_of, default_options
 from mimics.page import attached
-from mimics.workplace import HOOKS, furnish, some_points
-from repositories import fudan_model, run
+from mimics.workplace import HOOKS, some_points
+from repositories import VARIANTS, fudan_model, run
 from tiny import TinyStore, make_views
 from torch import Tensor
 
 from d2_plugin import D2Config, D2Error, D2Hooks
 from d2_plugin.adapters.cameras import intrinsics
 from d2_plugin.adapters.deformable3d import Deformable3DAdapter
-from d2_plugin.adapters.ex4dgs import Ex4DGSAdapter
 from d2_plugin.adapters.fudan import FudanAdapter
 from d2_plugin.adapters.hust4d import Hust4DAdapter
-from d2_plugin.adapters.inria import InriaAdapter
 from d2_plugin.adapters.keys import PriorKey
 from d2_plugin.adapters.spacetime import SpacetimeAdapter
 from d2_plugin.config import DepthLossConfig
@@ -74,18 +71,6 @@ class TestFieldsOfView:
 
 
 class TestFudan:
-    def test_the_depth_loss_is_a_mean_over_the_batch_like_the_photometric_one(self) -> None:
-        """Line 2 before the division by batch_size: a batch of twice the same view has the gradient of one."""
-        gradients = []
-        for batch_size in (1, 2):
-            model, scene = fudan_model()
-            d2 = D2Hooks(DEPTH_ALONE, FudanAdapter(model, scene), TinyStore())
-            for _ in range(batch_size):
-                (0 * model._xyz.sum() + d2.loss(1, scene.train_cameras[1.0][0]) / batch_size).backward()
-            gradients.append(model._xyz.grad)
-        torch.testing.assert_close(gradients[0], gradients[1])
-        assert gradients[0].any()
-
     @pytest.mark.parametrize("prefilter_var", [0.04, -1.0])
     @pytest.mark.parametrize("rot_4d", [True, False])
     def test_the_variants_of_the_temporal_marginal(self, rot_4d: bool, prefilter_var: float) -> None:
@@ -106,13 +91,6 @@ class TestFudan:
         model, _ = fudan_model()
         del model.prefilter_var
         assert len(FudanAdapter(model).slice_at(make_views()[0]).rows) > 0
-
-    def test_inserted_gaussians_live_around_their_frame(self) -> None:
-        model, _ = fudan_model()
-        points = some_points(3)._replace(times=torch.tensor([0.0, 0.25, 0.5]))
-        FudanAdapter(model).insert(points)
-        assert model._t[-3:, 0].tolist() == [0.0, 0.25, 0.5]
-        assert model._scaling_t[-1].item() == pytest.approx(0.5 * math.log(0.5 / 5))
 
     def test_points_that_are_not_finite_are_never_inserted(self) -> None:
         model, _ = fudan_model()
@@ -162,20 +140,6 @@ class TestDeformations:
             Hust4DAdapter(model, scene, "medium")
 
 
-class TestEx4DGS:
-    def test_inserted_rows_survive_the_next_prune(self) -> None:
-        """Two statistics are extended by its own callers by hand; without them the next prune_points fails."""
-        model, _ = ex4dgs.make()
-        model.training_setup(default_options())
-        adapter = Ex4DGSAdapter(model)
-        adapter.insert(some_points(3))
-        assert model.xyz_error_min[-3:].tolist() == [[1000.0]] * 3
-        assert model.min_radii2D[-3:].tolist() == [1000.0] * 3
-        with torch.no_grad():
-            model.prune_points(torch.arange(63) < 10, torch.empty(0))
-        assert len(adapter) == 53
-
-
 def test_another_codebase_than_the_adapters_is_refused() -> None:
     with pytest.raises(D2Error, match="SimpleNamespace has no densification_postfix, which FudanAdapter needs"):
         FudanAdapter(SimpleNamespace(_xyz=torch.zeros(3, 3)))
@@ -194,21 +158,10 @@ def test_points_inside_spacetime_have_its_own_start() -> None:
     torch.testing.assert_close(model._features_dc[-2:, 3:], some_points(2).colors)
 
 
-def lasting(name: str) -> InriaAdapter:
-    """An adapter of a repository whose Gaussians have an extent in time."""
-    if name == "spacetime":
-        model, _ = spacetime.make()
-        model.training_setup(default_options())
-        return SpacetimeAdapter(model, 2)
-    model, _ = fudan.make()
-    model.training_setup(default_options())
-    return FudanAdapter(model)
-
-
 @pytest.mark.parametrize("name", ["fudan", "spacetime"])
 def test_a_lifetime_is_the_standard_deviation_in_time(name: str) -> None:
     """One lifetime away from its instant exp(-1/2) of the opacity is left; a long one leaves the repository's start."""
-    adapter, brief = lasting(name), 0.02
+    adapter, brief = VARIANTS[name]().adapter, 0.02
     count = len(adapter)
     view = replace(make_views()[0], time=0.5)
     adapter.insert(some_points(2)._replace(lifetimes=torch.tensor([brief, torch.inf])))
@@ -223,8 +176,7 @@ def test_a_lifetime_is_the_standard_deviation_in_time(name: str) -> None:
 
 
 def test_without_rotation_in_time_fudan_keeps_the_log_of_a_variance() -> None:
-    model, _ = fudan.make()
-    model.training_setup(default_options())
+    model, _ = fudan_model()
     adapter, rows = FudanAdapter(model), []
     model.rot_4d, model.densification_postfix = False, lambda *columns: rows.extend(columns)
     adapter._append(some_points(1)._replace(lifetimes=torch.tensor([0.02])))
@@ -232,12 +184,11 @@ def test_without_rotation_in_time_fudan_keeps_the_log_of_a_variance() -> None:
     assert rows[8] is None
 
 
-def test_hooks_may_wait_for_the_field_of_a_warm_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.usefixtures("workplace")
+def test_hooks_may_wait_for_the_field_of_a_warm_up() -> None:
     """Until iteration 30 the mimic fits one still scene to all instants, as Deformable-3D-Gaussians until 3000."""
-    furnish(tmp_path, monkeypatch)
     source = attached(deformable3d, "deformable3d", "d2.backbone.in_warm_up = False")
-    assert not run("deformable3d", source, stop=29).d2.trace
-    assert min(entry.step for entry in run("deformable3d", source, stop=45).d2.trace) == 30
+    assert min(entry.step for entry in run("deformable3d", source, stop=36).d2.trace) == 30
     models = deformable3d.make()[:2]
     assert Deformable3DAdapter(*models, warm_up=30).active(1)
     assert not Deformable3DAdapter(*models, warm_up=30, in_warm_up=False).active(29)

@@ -17,14 +17,8 @@ from torch import Tensor
 from d2_plugin.compat import depth, inria, nearest, vision
 from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.photometric import ssim
-from d2_plugin.gaussians.spherical_harmonics import colors as harmonic_colors
 from d2_plugin.protocol import Splats, View
 from d2_plugin.rasterizer import rasterize
-
-
-@pytest.fixture
-def camera() -> dict:
-    return inria_camera(view_24x16())
 
 
 class TestThreeDGS:
@@ -99,13 +93,6 @@ class TestThreeDGS:
         assert radii.tolist() == [math.ceil(3 * math.sqrt(variance + math.sqrt(0.1))), 0, 0, 0]
         assert raster.markVisible(means).tolist() == [True, False, False, True]
 
-    def test_harmonics_see_the_gaussian_from_the_camera(self) -> None:
-        values = gaussians(5)
-        centre = torch.tensor([0.5, 0.1, -1.0], dtype=torch.float64)
-        result = inria.colors_of(values["shs"], 2, values["means3D"], centre)
-        expected = harmonic_colors(values["shs"][:, :9], values["means3D"] - centre, None, 2, 0)
-        torch.testing.assert_close(result, expected)
-
     def test_a_field_of_view_of_minus_one_is_mended_and_said(self, camera: dict, caplog) -> None:
         """fudan-zvg/4d-gaussian-splatting issue 64: tanfov = tan(-0.5) where fl_x is given."""
         values = gaussians()
@@ -157,7 +144,7 @@ class TestNearest:
         np.fill_diagonal(squared, np.inf)
         return np.sort(squared, 1)[:, : min(3, len(points) - 1)].mean(1)
 
-    @settings(max_examples=60, deadline=None)
+    @settings(max_examples=40)
     @given(st.integers(2, 60), st.integers(0, 1000), st.sampled_from(["even", "line", "outliers", "repeated"]))
     def test_is_the_mean_of_the_three_smallest_squared_distances(self, count: int, seed: int, kind: str) -> None:
         points = np.random.default_rng(seed).normal(size=(count, 3)).astype(np.float32)

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from rasterizer_arguments import gaussians, inria_camera, view_24x16
+from rasterizer_arguments import gaussians, inria_camera
 from slice_scenes import GOLDEN
 from splat_scenes import single
 from torch import Tensor
@@ -26,11 +26,6 @@ def four_dimensional(count: int = 6, seed: int = 0) -> dict[str, Tensor]:
     values["ts"] = torch.full((count, 1), 0.25, dtype=torch.float64, requires_grad=True)
     values["scales_t"] = torch.full((count, 1), 0.4, dtype=torch.float64, requires_grad=True)
     return {**values, "rotations_r": right.requires_grad_()}
-
-
-@pytest.fixture
-def camera() -> dict:
-    return inria_camera(view_24x16())
 
 
 class TestFourD:

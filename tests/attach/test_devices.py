@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 import torch
-from fake_gpu import FakeGpu, OnGpu, fake_gpu, move  # noqa: F401  a fixture
-from mimics.workplace import furnish
+from fake_gpu import OnGpu, fake_gpu, move  # noqa: F401  a fixture
 from repositories import VARIANTS
 from tiny import make_views
 
@@ -20,13 +17,8 @@ ALL = D2Config(prior="prior", densify=DensifyConfig(start=2, every=2), depth_los
 
 
 @pytest.mark.parametrize("name", ["gsplat", "deformable3d", "fastergs4d"])
-def test_a_view_on_the_cpu_goes_where_the_gaussians_are(
-    name: str,
-    fake_gpu: FakeGpu,  # noqa: F811
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    furnish(tmp_path, monkeypatch)
+@pytest.mark.usefixtures("workplace", "fake_gpu")
+def test_a_view_on_the_cpu_goes_where_the_gaussians_are(name: str) -> None:
     d2 = D2Hooks(ALL, move(VARIANTS[name]().adapter))
     for step, view in enumerate(make_views()[:2], 1):
         assert isinstance(d2.loss(step, view), OnGpu)
@@ -35,13 +27,8 @@ def test_a_view_on_the_cpu_goes_where_the_gaussians_are(
 
 
 @pytest.mark.parametrize("hook", ["depth_loss", "densify"])
-def test_a_backbone_that_leaves_it_there_is_told_which_view(
-    hook: str,
-    fake_gpu: FakeGpu,  # noqa: F811
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    furnish(tmp_path, monkeypatch)
+@pytest.mark.usefixtures("workplace", "fake_gpu")
+def test_a_backbone_that_leaves_it_there_is_told_which_view(hook: str) -> None:
     adapter = move(VARIANTS["gsplat"]().adapter)
     adapter.view = lambda camera: camera
     d2 = D2Hooks.from_config({"prior": "prior", hook: {"start": 1, "every": 1}}, adapter, iterations=10)
@@ -52,7 +39,8 @@ def test_a_backbone_that_leaves_it_there_is_told_which_view(
         run()
 
 
-def test_kernels_take_a_camera_on_the_cpu(fake_gpu: FakeGpu) -> None:  # noqa: F811
+@pytest.mark.usefixtures("fake_gpu")
+def test_kernels_take_a_camera_on_the_cpu() -> None:
     view, count = make_views()[0], 20
     generator = torch.Generator().manual_seed(0)
     means = torch.rand(count, 3, generator=generator) + torch.tensor([-0.5, -0.5, 2.0])
@@ -64,11 +52,8 @@ def test_kernels_take_a_camera_on_the_cpu(fake_gpu: FakeGpu) -> None:  # noqa: F
 
 
 @pytest.mark.parametrize("on_gpu", [False, True])
-def test_a_million_gaussians_without_kernels_are_refused(
-    on_gpu: bool,
-    fake_gpu: FakeGpu,  # noqa: F811
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+@pytest.mark.usefixtures("fake_gpu")
+def test_a_million_gaussians_without_kernels_are_refused(on_gpu: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cuda if on_gpu else native, "available", lambda *_: False)
     view = make_views()[0]
 

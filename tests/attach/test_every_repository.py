@@ -11,23 +11,15 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mimics.page import attached
-from mimics.workplace import furnish, some_points
+from mimics.workplace import some_points
 from repositories import MIMICS, VARIANTS, run, saved, snapshot
 from torch import Tensor
 
 from d2_plugin import D2Config
-from d2_plugin.adapters.successors.gsplat_dynamic import GsplatDynamicAdapter
 from d2_plugin.protocol import Backbone
 from d2_plugin.rasterizer import rasterize
 from d2_plugin.registry import ADAPTERS, load
 from d2_plugin.testing import Example, check_backbone
-
-
-@pytest.fixture
-def workplace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder with a prior and a d2.toml; the one camera of gsplat's dynamic trainer is the middle one there."""
-    monkeypatch.setitem(GsplatDynamicAdapter.__init__.__kwdefaults__, "camera", "cam1")
-    return furnish(tmp_path, monkeypatch)
 
 
 def same(a: SimpleNamespace, b: SimpleNamespace) -> bool:
@@ -53,17 +45,18 @@ def resuming(hooks: type, state: dict) -> type:
 class TestTraining:
     def test_all_hooks_off_is_bitwise_the_bare_loop(self, name: str, workplace: Path) -> None:
         (workplace / "d2.toml").write_text(D2Config().to_toml())
-        assert same(run(name, stop=60), run(name, attached(MIMICS[name], name), stop=60))
+        assert same(run(name, stop=30), run(name, attached(MIMICS[name], name), stop=30))
 
-    def test_a_resumed_run_is_bitwise_the_uninterrupted_one(self, name: str, workplace: Path) -> None:
+    @pytest.mark.usefixtures("workplace")
+    def test_a_resumed_run_is_bitwise_the_uninterrupted_one(self, name: str) -> None:
         source = attached(MIMICS[name], name)
-        whole, first = run(name, source, stop=80), run(name, source, stop=53)
+        whole, first = run(name, source, stop=42), run(name, source, stop=22)
         assert {entry.hook for entry in whole.d2.trace} == {"densify", "prune", "depth_loss"}
         assert all(value.isfinite().all() for value in snapshot(whole).values())
-        checkpoint, state = copy.deepcopy((saved(name, first), 53)), copy.deepcopy(first.d2.state_dict())
-        forgetful = run(name, source, checkpoint=copy.deepcopy(checkpoint), stop=80)
+        checkpoint, state = (saved(name, first), 22), copy.deepcopy(first.d2.state_dict())
+        forgetful = run(name, source, checkpoint=copy.deepcopy(checkpoint), stop=42)
         source.D2Hooks = resuming(source.D2Hooks, state)
-        assert same(whole, run(name, source, checkpoint=checkpoint, stop=80))
+        assert same(whole, run(name, source, checkpoint=checkpoint, stop=42))
         assert not same(whole, forgetful), "D2's state does not matter: this could not fail"
 
 
@@ -88,7 +81,7 @@ class TestAdapter:
         assert isinstance(make().backbone, Backbone)
         assert {"moments", "grow"} <= set(check_backbone(make))
 
-    @settings(max_examples=15, deadline=None)
+    @settings(max_examples=12, deadline=None)
     @given(data=st.data())
     def test_rows_are_followed_through_any_edits(self, name: str, data: st.DataObject) -> None:
         """Rows are numbered anew before every edit; the reports to listeners must lead back to the numbers."""

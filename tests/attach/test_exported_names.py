@@ -10,13 +10,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from mimics.workplace import fused_prior
 from stand_in_recordings import smooth_recording
 from tiny import TinyStore
 
-from d2_plugin.adapters.inria import InriaAdapter, RenderedCamera
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.frame import describe_recording
-from d2_plugin.priors.fuse import FusedPrior
 from d2_plugin.protocol import EXPORT_FILE
 from d2_plugin.recordings.export.export import export_recording
 from d2_plugin.recordings.export.ply import PointCloud
@@ -32,12 +31,9 @@ def exported(tmp_path: Path) -> SimpleNamespace:
     first = [*recording.cameras][:1]
     folder = export_recording(recording, "colmap_frames", tmp_path / "data", test_cameras=first, cloud=cloud)
     store = PriorStore.create(tmp_path / "prior", [*recording.cameras], recording.frames, describe_recording(recording))
-    for camera, calibrated in recording.cameras.items():
+    for camera in recording.cameras:
         for frame in recording.frames:
-            shape = (calibrated.height, calibrated.width)
-            depth = np.full(shape, 2.0 + frame, np.float32)
-            labels, sigma = np.full(shape, 2, np.uint8), np.full(shape, 0.01, np.float32)
-            store.write(camera, frame, FusedPrior(depth, labels, sigma, np.zeros((*shape, 3), np.uint8)), {})
+            store.write(camera, frame, fused_prior(2.0 + frame, recording.image(camera, frame)), {})
     names = json.loads((folder / EXPORT_FILE).read_text())
     return SimpleNamespace(recording=recording, folder=folder, prior=tmp_path / "prior", names=names)
 
@@ -101,9 +97,3 @@ def test_a_camera_of_the_recording_without_a_prior_has_none(exported, tmp_path: 
 def test_a_folder_without_export_is_refused(tmp_path: Path) -> None:
     with pytest.raises(D2Error, match="give the folder that `d2 export-recording` wrote"):
         RenamedStore.of_export(TinyStore(), tmp_path)
-
-
-def test_adapters_say_the_image_of_a_camera() -> None:
-    camera = SimpleNamespace(image_path=Path("/d/cam01/3.png"))
-    assert InriaAdapter.image_name(None, RenderedCamera(camera, {})) == "/d/cam01/3.png"
-    assert InriaAdapter.image_name(None, SimpleNamespace()) is None

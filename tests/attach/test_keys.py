@@ -5,22 +5,25 @@ from __future__ import annotations
 from types import SimpleNamespace
 
 import pytest
-from mimics import deformable3d, ex4dgs, fudan, hust4d, spacetime
+from mimics import ex4dgs, fudan, hust4d
 from mimics.inria import cameras_of
+from repositories import VARIANTS
 from tiny import make_views
 
 from d2_plugin import D2Error
-from d2_plugin.adapters.deformable3d import Deformable3DAdapter
 from d2_plugin.adapters.ex4dgs import Ex4DGSAdapter
 from d2_plugin.adapters.fudan import FudanAdapter
 from d2_plugin.adapters.hust4d import Hust4DAdapter
 from d2_plugin.adapters.keys import KeysByPose, PriorKey, frame_of_time, key_from_image_name, one_image_each
-from d2_plugin.adapters.spacetime import SpacetimeAdapter
 
 READERS = [
     # adapter, what the reader leaves on a camera object, key; from the files of each repository at the pages' commits
     ("fudan", {"image_path": "/d/images/cam01_0003.png", "image_name": "cam01_0003", "uid": 9}, ("cam01", 3)),
     ("fudan", {"image_path": None, "image_name": "cam01_0003", "uid": 9}, ("cam01", 3)),
+    ("fudan", {"image_path": "/data/scene/cam01/images/0003.png"}, ("cam01", 3)),
+    ("fudan", {"image_path": "scene/cam07/frame_00012.jpg"}, ("cam07", 12)),
+    ("fudan", {"image_path": "a_b_12.png"}, ("a_b", 12)),
+    ("fudan", {"image_path": r"C:\scene\cam02\images\0004.png"}, ("cam02", 4)),
     ("deformable3d", {"image_name": "cam01_0003.png", "fid": 0.1}, ("cam01", 3)),
     ("deformable3d", {"image_name": "left1_000012", "fid": 0.1}, ("left1", 12)),
     ("spacetime", {"image_name": "cam04", "timestamp": 0.5}, ("cam04", 1)),
@@ -35,31 +38,7 @@ READERS = [
 ]
 
 
-def default_key(name: str, camera: SimpleNamespace) -> PriorKey:
-    makers = {
-        "fudan": lambda: FudanAdapter(fudan.make()[0]),
-        "deformable3d": lambda: Deformable3DAdapter(*deformable3d.make()[:2]),
-        "spacetime": lambda: SpacetimeAdapter(spacetime.make()[0], 2),
-        "ex4dgs": lambda: Ex4DGSAdapter(ex4dgs.make()[0]),
-    }
-    return makers[name]()._default_key(camera)
-
-
 class TestNames:
-    @pytest.mark.parametrize(
-        ("image", "key"),
-        [
-            ("cam01_0003", ("cam01", 3)),
-            ("/data/scene/images/cam01_0003.png", ("cam01", 3)),
-            ("/data/scene/cam01/images/0003.png", ("cam01", 3)),
-            ("scene/cam07/frame_00012.jpg", ("cam07", 12)),
-            ("a_b_12.png", ("a_b", 12)),
-            (r"C:\scene\cam02\images\0004.png", ("cam02", 4)),
-        ],
-    )
-    def test_images_tell_camera_and_frame(self, image: str, key: tuple[str, int]) -> None:
-        assert key_from_image_name(image) == key
-
     def test_a_name_without_a_camera_is_refused_with_the_way_out(self) -> None:
         with pytest.raises(D2Error, match=r"image '0003.png' does not say its camera.*function `key`"):
             key_from_image_name("0003.png")
@@ -92,26 +71,24 @@ class TestNames:
         listed = SimpleNamespace(train_camera=SimpleNamespace(dataset=infos))
         assert Hust4DAdapter(model, listed, "fine").view(scene.cameras[4]).camera == "cam1"
 
-    def test_ex4dgs_reads_the_path_of_the_image(self) -> None:
-        """Its `timestamp` is no frame number: it starts at 0 wherever the clip starts, and padding mirrors it."""
+    def test_the_timestamp_of_ex4dgs_is_no_frame_number(self) -> None:
+        """It starts at 0 wherever the clip starts, and padding mirrors it."""
         model, scene = ex4dgs.make()
         camera = scene.cameras[4]
         camera.timestamp = -1
-        view = Ex4DGSAdapter(model).view(camera)
-        assert (view.camera, view.frame, view.time) == ("cam1", 1, -1.0)
-        assert Ex4DGSAdapter(model, first_frame=100).view(camera).frame == 101
+        view = Ex4DGSAdapter(model, first_frame=100).view(camera)
+        assert (view.camera, view.frame, view.time) == ("cam1", 101, -1.0)
 
     @pytest.mark.parametrize(("adapter", "fields", "key"), READERS)
     def test_what_every_reader_hands_out(self, adapter: str, fields: dict, key: tuple[str, int]) -> None:
-        assert default_key(adapter, SimpleNamespace(**fields)) == key
+        assert VARIANTS[adapter]().adapter.prior_key(SimpleNamespace(**fields)) == key
 
     def test_hypernerf_of_hust_says_the_folder_and_the_file_apart(self) -> None:
         """scene/hyper_loader.py:165; its order of training images is another than that of all images."""
         files = [SimpleNamespace(image_path="/data/vrig/rgb/2x", image_name=f"left1_00000{i}.png") for i in (7, 9)]
         scene = SimpleNamespace(train_camera=SimpleNamespace(dataset=files))
-        model, _ = hust4d.make()
-        adapter = Hust4DAdapter(model, scene, "fine")
-        assert adapter._default_key(SimpleNamespace(uid=1, image_name="1")) == ("left1", 9)
+        adapter = Hust4DAdapter(hust4d.make()[0], scene, "fine")
+        assert adapter.prior_key(SimpleNamespace(uid=1, image_name="1")) == ("left1", 9)
 
     def test_a_key_of_ones_own_goes_before_everything(self) -> None:
         model, scene = fudan.make()

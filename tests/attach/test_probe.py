@@ -6,13 +6,11 @@ import logging
 
 import pytest
 import torch
-from mimics import ex4dgs, fudan
-from mimics.inria import default_options
+from mimics import fudan
 from repositories import fudan_model
 from tiny import TinyStore
 
 from d2_plugin import D2Config, D2Hooks
-from d2_plugin.adapters.ex4dgs import Ex4DGSAdapter
 from d2_plugin.adapters.fudan import FudanAdapter
 from d2_plugin.adapters.probe import probe_package
 from d2_plugin.config import DepthLossConfig
@@ -22,14 +20,6 @@ DEPTH_ALONE = D2Config(depth_loss=DepthLossConfig(every=1))
 
 
 class TestProbe:
-    def test_without_a_package_one_sentence_says_who_renders(self, caplog: pytest.LogCaptureFixture) -> None:
-        model, scene = fudan_model()
-        d2 = D2Hooks(DEPTH_ALONE, FudanAdapter(model, scene), TinyStore())
-        with caplog.at_level(logging.INFO, logger="d2_plugin.adapters.inria"):
-            for step in (1, 2):
-                d2.loss(step, scene.train_cameras[1.0][0])
-        assert caplog.text.count("no render of the trainer was passed along") == 1
-
     def test_fudans_own_render_is_used_and_equals_ours(self, caplog: pytest.LogCaptureFixture) -> None:
         model, scene = fudan_model()
         adapter = FudanAdapter(model, scene)
@@ -96,12 +86,3 @@ class TestProbe:
         empty = own._replace(alpha=torch.zeros_like(own.alpha))
         assert not probe_package(package, empty, (model._xyz, model._opacity)).final
         assert probe_package(package, own, (model._xyz, model._opacity)).usable
-
-    def test_ex4dgs_says_acc_and_divides_so_ours_is_used(self) -> None:
-        model, scene = ex4dgs.make()
-        model._scaling.data += 1.0
-        model.training_setup(default_options())
-        adapter = Ex4DGSAdapter(model)
-        d2 = D2Hooks(DEPTH_ALONE, adapter, TinyStore())
-        d2.loss(1, adapter.rendered(scene.cameras[0], ex4dgs.render(scene.cameras[0], model, [0, 0, 0])))
-        assert "has no alpha" in adapter.probe.sentence

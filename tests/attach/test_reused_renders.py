@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -11,7 +10,6 @@ import pytest
 import torch
 from mimics import deformable3d, gsplat, hust4d, spacetime
 from mimics.inria import default_options
-from mimics.workplace import furnish
 from tiny import make_views
 from torch import Tensor
 
@@ -23,18 +21,8 @@ from d2_plugin.adapters.spacetime import SpacetimeAdapter
 from d2_plugin.config import D2Config, DepthLossConfig
 
 
-class Attached(SimpleNamespace):
+def make(name: str) -> SimpleNamespace:
     """A mimic with the depth loss alone: its adapter, cameras, what they depend on in time, and how it draws one."""
-
-    adapter: Any
-    moves: list[Tensor]
-    cameras: list[Any]
-    draw: Callable[[Any], object]
-    d2: D2Hooks
-    calls: list[int]
-
-
-def make(name: str) -> Attached:
     calls: list[int] = []
     if name == "spacetime":
         model, scene = spacetime.make()
@@ -68,18 +56,18 @@ def make(name: str) -> Attached:
         field.register_forward_hook(lambda *_: calls.append(1))
         moves = list(field.parameters())
     d2 = D2Hooks(D2Config(prior="prior", depth_loss=DepthLossConfig()), adapter)
-    return Attached(adapter=adapter, moves=moves, cameras=scene.cameras, draw=draw, d2=d2, calls=calls, model=model)
+    cameras = scene.cameras
+    return SimpleNamespace(adapter=adapter, moves=moves, cameras=cameras, draw=draw, d2=d2, calls=calls, model=model)
 
 
-def gradients(made: Attached, loss: Tensor) -> list[Tensor]:
+def gradients(made: SimpleNamespace, loss: Tensor) -> list[Tensor]:
     parameters = [*made.moves, made.model._xyz, made.model._opacity]
     parts = torch.autograd.grad(loss, parameters, allow_unused=True)
     return [torch.zeros_like(p) if part is None else part for p, part in zip(parameters, parts, strict=True)]
 
 
 @pytest.fixture(params=["hust4d", "deformable3d", "spacetime"])
-def name(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
-    furnish(tmp_path, monkeypatch)
+def name(request: pytest.FixtureRequest, workplace: Path) -> str:
     return request.param
 
 
@@ -120,9 +108,9 @@ def test_what_cannot_be_assigned_is_evaluated_anew(name: str) -> None:
     assert len(made.calls) == 1
 
 
-def test_a_render_that_leaves_no_new_fading_is_not_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.usefixtures("workplace")
+def test_a_render_that_leaves_no_new_fading_is_not_used() -> None:
     """Some renders of SpacetimeGaussians evaluate rotations and leave `trbfoutput` as an earlier view has it."""
-    furnish(tmp_path, monkeypatch)
     made = make("spacetime")
     made.draw(made.cameras[0])
     assert len(made.adapter._unassigned) == 1
@@ -157,8 +145,8 @@ def test_gsplat_gives_its_own_depth_once() -> None:
     assert adapter.rendered_depth(views[1]) is None, "renders of an earlier step are out of date"
 
 
-def test_offsets_at_noisy_times_are_not_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    furnish(tmp_path, monkeypatch)
+@pytest.mark.usefixtures("workplace")
+def test_offsets_at_noisy_times_are_not_used() -> None:
     made = make("deformable3d")
     made.adapter.exact_times = False
     for step, evaluations in ((1, 2), (20_000, 1)):

@@ -3,25 +3,21 @@
 from __future__ import annotations
 
 import logging
+import math
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
 from mimics import fudan
 from mimics.page import attached
-from mimics.workplace import furnish
 from tiny import ALL_HOOKS, TinyFrames, TinyStore, make_adapter, make_model
 
 from d2_plugin import D2Config, D2Hooks
 from d2_plugin.backbones.trainer import Trainer, TrainSettings
 from d2_plugin.hooks import reports
 from d2_plugin.hooks.reports import Report
-
-
-@pytest.fixture
-def workplace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    return furnish(tmp_path, monkeypatch)
 
 
 def lines(caplog: pytest.LogCaptureFixture) -> list[str]:
@@ -37,28 +33,25 @@ def logged(config: D2Config, store: TinyStore | None = None, **how: object) -> T
     return Trainer(make_model(), TinyFrames(), TrainSettings(iterations=30, seed=3), attach)
 
 
-def test_the_printed_lines_say_what_happens(workplace: Path, caplog, monkeypatch) -> None:
-    monkeypatch.setattr(reports, "PAUSE", 0.0)
+@pytest.mark.parametrize("pause", [0.0, math.inf])
+@pytest.mark.usefixtures("workplace")
+def test_the_printed_lines_say_what_happens_and_keep_their_distance(pause: float, caplog, monkeypatch) -> None:
+    monkeypatch.setattr(reports, "PAUSE", pause)
     with caplog.at_level(logging.INFO):
-        run = attached(fudan, "fudan").training(*fudan.make())
+        run = attached(fudan, "fudan").training(*fudan.make(), stop=25)
         run.d2.log.end()
     said = lines(caplog)
     first = next(line for line in said if line.startswith("attached by FudanAdapter to "))
     assert "priors of cameras cam0, cam1, cam2; densify 5 to 95 every 10, prune 5 to 90 every 10" in first
-    assert any("D2 renders depth with its own rasterizer" in line for line in said)
+    assert sum("D2 renders depth with its own rasterizer" in line for line in said) == 1
     steps = [line for line in said if line.startswith("step ")]
-    assert steps
+    edits = {entry.step for entry in run.d2.trace if entry.action in ("insert", "remove") and entry.count}
+    assert len(steps) == (1 if pause else len(edits))
     assert " inserted, " in steps[0]
     assert "depth_loss " in steps[0]
     assert said[-1] == run.d2.log.summary()
     inserted = sum(entry.count for entry in run.d2.trace if entry.action == "insert")
     assert said[-1].startswith(f"densify, prune, depth_loss: {inserted} inserted, ")
-
-
-def test_lines_of_progress_keep_their_distance(workplace: Path, caplog) -> None:
-    with caplog.at_level(logging.INFO):
-        attached(fudan, "fudan").training(*fudan.make())
-    assert len([line for line in lines(caplog) if line.startswith("step ")]) == 1
 
 
 def test_a_callback_and_a_writer_get_every_change() -> None:
@@ -85,7 +78,7 @@ def test_a_program_without_logging_shows_them_and_one_that_ends_gets_the_summary
     code = (
         "from tiny import *\n"
         "attach = lambda model: D2Hooks.from_config(ALL_HOOKS, make_adapter(model), TinyStore(), iterations=30)\n"
-        "Trainer(make_model(), TinyFrames(), TrainSettings(iterations=30), attach).run()\n"
+        "Trainer(make_model(), TinyFrames(), TrainSettings(iterations=3), attach).run()\n"
         "import sys; sys.stderr.write('end of the script\\n')"
     )
     tests = str(Path(__file__).parents[1])
@@ -118,7 +111,7 @@ class TestSchedules:
         assert (config.densify.start, config.densify.stop, config.densify.every) == (100, 15000, 50)
         assert config.prune.stop > 15000
         assert D2Config.from_dict({"prior": "x", "densify": {}}).densify.stop == 1500
-        assert D2Config.from_dict({**config_as_read(config)}) == config
+        assert D2Config.from_dict(tomllib.loads(config.to_toml())) == config
 
     def test_the_trainer_says_its_length_in_the_first_line(self, workplace: Path) -> None:
         (workplace / "d2.toml").write_text('prior = "prior"\n[densify]\n')
@@ -152,9 +145,3 @@ class TestSchedules:
         assert [line.partition(",")[0] for line in lines(caplog) if "default schedule" in line] == warned
         if iterations:
             assert d2.config.densify.stop == 450
-
-
-def config_as_read(config: D2Config) -> dict:
-    import tomllib
-
-    return tomllib.loads(config.to_toml())

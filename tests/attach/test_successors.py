@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from types import SimpleNamespace
 
@@ -26,23 +27,29 @@ class TestFasterGS4D:
             make_fastergs4d().adapter.view({})
 
 
-class TestSwift4D:
-    def test_points_move_where_their_surroundings_move(self) -> None:
-        """The nearest logit decides, and what moves is put where the field carries it onto the point."""
-        standing = make_swift4d()
-        model, view = standing.model, standing.adapter.view(standing.cameras[0])
-        placed = standing.adapter.slice_at(view).means.detach()
-        moving, still = (torch.nonzero(model._dynamic[:, 0] > 0)[0], torch.nonzero(model._dynamic[:, 0] < 0)[0])
-        near = torch.cat([placed[moving], placed[still]]) + 1e-3
-        ones = torch.ones(2)
-        points = Points(near, torch.rand(2, 3), ones / 2, ones * 0.05, ones * view.time)
-        assert standing.adapter.insert(points) == 2
-        assert (model._dynamic[-2:, 0] > 0).tolist() == [True, False]
-        assert standing.adapter.inversion.accepted.all()
-        found = standing.adapter.slice_at(view).means[-2:]
-        torch.testing.assert_close(found, near, atol=0.03, rtol=0)
-        assert not torch.equal(model._xyz[-2], near[0])
+@pytest.mark.parametrize(
+    ("make", "moves"),
+    [
+        (make_swift4d, lambda adapter: adapter.gaussians._dynamic[:, 0] > 0),
+        (make_gsplat_dynamic, lambda adapter: adapter.state["dynamic_mask"]),
+    ],
+)
+def test_points_move_where_their_surroundings_move(make: Callable, moves: Callable) -> None:
+    """The nearest Gaussian decides, and what moves is put where the field carries it onto the point."""
+    standing = make()
+    adapter, view = standing.adapter, standing.adapter.view(standing.cameras[1])
+    placed, known = adapter.slice_at(view).means.detach(), moves(adapter)
+    near = torch.cat([placed[known][:1], placed[~known][:1]]) + 1e-3
+    ones = torch.ones(2)
+    assert adapter.insert(Points(near, torch.rand(2, 3), ones / 2, ones * 0.05, ones * view.time)) == 2
+    assert moves(adapter)[-2:].tolist() == [True, False]
+    assert adapter.inversion.accepted.all()
+    torch.testing.assert_close(adapter.slice_at(view).means[-2:], near, atol=0.03, rtol=0)
+    raw = standing.model["means"] if make is make_gsplat_dynamic else standing.model._xyz
+    assert not torch.equal(raw[-2], near[0])
 
+
+class TestSwift4D:
     def test_inserted_rows_survive_the_next_weight_prune(self) -> None:
         """It takes what was hardly seen since the last one, also what was inserted a moment ago."""
         standing = make_swift4d()
@@ -83,17 +90,6 @@ def motion_of(model, children: Tensor) -> Tensor:
 
 
 class TestGsplatDynamic:
-    def test_inserted_rows_are_marked_as_their_neighbours_are(self) -> None:
-        standing = make_gsplat_dynamic()
-        adapter, view = standing.adapter, standing.adapter.view(standing.cameras[1])
-        placed = adapter.slice_at(view).means.detach()
-        moving, still = torch.tensor([1]), torch.tensor([0])
-        near = torch.cat([placed[moving], placed[still]]) + 1e-3
-        ones = torch.ones(2)
-        assert adapter.insert(Points(near, torch.rand(2, 3), ones / 2, ones * 0.05, ones * view.time)) == 2
-        assert adapter.state["dynamic_mask"][-2:].tolist() == [True, False]
-        torch.testing.assert_close(adapter.slice_at(view).means[-2:], near, atol=0.03, rtol=0)
-
     def test_an_item_without_its_number_of_frames_is_refused(self) -> None:
         params, optimizers, hexplane, net = gsplat_dynamic.make()
         with pytest.raises(D2Error, match="the strategy's state has no 'dynamic_mask'"):

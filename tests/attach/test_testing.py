@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
@@ -14,7 +15,7 @@ from torch.optim import Optimizer
 
 from d2_plugin.adapters.watched import WatchedModel
 from d2_plugin.backbones.densify import grow
-from d2_plugin.protocol import Points, RasterSettings, Render, Splats, View
+from d2_plugin.protocol import Points, RasterSettings, Render, View
 from d2_plugin.testing import CHECKS, ContractError, Example, check_backbone
 
 
@@ -83,9 +84,11 @@ def broken(change: Callable[[WatchedModel], None]) -> str:
     return str(caught.value)
 
 
-def changed(
-    name: str, given: Callable = lambda value: value, back: Callable = lambda value: value
-) -> Callable[[WatchedModel], None]:
+def same(value: object) -> object:
+    return value
+
+
+def changed(name: str, back: Callable = same, given: Callable = same) -> Callable[[WatchedModel], None]:
     """An adapter one of whose methods gets, or gives back, something else."""
 
     def apply(adapter: WatchedModel) -> None:
@@ -99,16 +102,9 @@ def with_view(**changes: Callable[[View], object]) -> Callable[[WatchedModel], N
     return changed("view", back=lambda view: replace(view, **{name: make(view) for name, make in changes.items()}))
 
 
-def with_slice(change: Callable[[Splats], Splats]) -> Callable[[WatchedModel], None]:
-    return changed("slice_at", back=change)
-
-
-def with_insert(change: Callable[[Points], Points]) -> Callable[[WatchedModel], None]:
-    return changed("insert", given=change)
-
-
-def with_report(change: Callable[[Tensor], Tensor]) -> Callable[[WatchedModel], None]:
-    return changed("_report", given=change)
+with_slice = partial(changed, "slice_at")
+with_insert = partial(changed, "insert", same)
+with_report = partial(changed, "_report", same)
 
 
 def after_remove(change: Callable[[Optimizer, Mapping[str, Tensor]], None]) -> Callable[[WatchedModel], None]:

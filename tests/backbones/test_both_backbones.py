@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Iterator
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -33,7 +33,6 @@ from d2_plugin.backbones.starting import nearest_neighbour_scales
 from d2_plugin.backbones.trainer import Trainer, TrainSettings
 from d2_plugin.backbones.yang4d import create
 from d2_plugin.gaussians import spherical_harmonics as sh
-from d2_plugin.gaussians.photometric import photometric_loss
 from d2_plugin.protocol import Backbone, Points
 
 COUNT = 20
@@ -46,14 +45,6 @@ edits = st.lists(st.tuples(st.sampled_from(EDITS), st.integers(0, 2**16)), max_s
 @pytest.fixture(params=BACKBONES)
 def backbone(request: pytest.FixtureRequest) -> str:
     return request.param
-
-
-@pytest.fixture(params=[1, 2], ids=["one thread", "two threads"])
-def threads(request: pytest.FixtureRequest) -> Iterator[int]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(request.param)
-    yield request.param
-    torch.set_num_threads(before)
 
 
 def bend_field(model: SplatModel, strength: float = 0.02) -> None:
@@ -113,7 +104,7 @@ def apply(action: str, seed: int, adapter: Backbone, model: SplatModel) -> None:
 
 
 @pytest.mark.parametrize("name", BACKBONES)
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=20)
 @given(sequence=edits)
 def test_every_per_gaussian_state_stays_on_its_row(name: str, sequence: list[tuple[str, int]]) -> None:
     """Numbers follow the reports; parameters, Adam moments, statistics and pruning streaks must have followed too."""
@@ -139,18 +130,19 @@ def test_every_per_gaussian_state_stays_on_its_row(name: str, sequence: list[tup
 
 @pytest.mark.parametrize("temporal", [True, False])
 def test_all_hooks_off_is_bitwise_the_bare_trainer(backbone: str, temporal: bool) -> None:
-    bare, off = (make_trainer(config, temporal=temporal, backbone=backbone) for config in (None, D2Config()))
-    bare.run()
-    off.run()
-    assert same(parameters(bare), parameters(off))
-    full = make_trainer(ALL_HOOKS, temporal=temporal, backbone=backbone)
-    full.run()
-    assert not same(parameters(bare), parameters(full)), "the hooks changed nothing: this test could not fail"
+    trainers = [make_trainer(c, 12, temporal=temporal, backbone=backbone) for c in (None, D2Config(), ALL_HOOKS)]
+    for trainer in trainers:
+        trainer.run()
+    bare, off, full = map(parameters, trainers)
+    assert same(bare, off)
+    assert not same(bare, full), "the hooks changed nothing: this test could not fail"
 
 
-@pytest.mark.parametrize("hooks", [True, False], ids=["all hooks", "no hooks"])
-def test_a_resumed_run_is_bitwise_the_uninterrupted_one(backbone: str, hooks: bool, threads: int) -> None:
-    config = ALL_HOOKS if hooks else None
+@pytest.mark.parametrize(("config", "count"), [(ALL_HOOKS, 1), (ALL_HOOKS, 2), (None, 1)])
+def test_a_resumed_run_is_bitwise_the_uninterrupted_one(
+    backbone: str, config: D2Config | None, count: int, threads: Callable[[int], None]
+) -> None:
+    threads(count)
     whole, first = (make_trainer(config, backbone=backbone) for _ in range(2))
     whole.run()
     first.run(until=17)
@@ -166,7 +158,7 @@ def test_a_resumed_run_is_bitwise_the_uninterrupted_one(backbone: str, hooks: bo
 
 def test_training_lowers_the_loss_of_the_tiny_scene(backbone: str) -> None:
     losses: list[float] = []
-    trainer = make_trainer(iterations=150, backbone=backbone)
+    trainer = make_trainer(iterations=100, backbone=backbone)
     trainer.run(on_step=lambda step, loss: losses.append(loss))
     assert sum(losses[-6:]) < 0.5 * sum(losses[:6])
     assert is_finite(trainer)
@@ -189,30 +181,19 @@ def test_a_time_that_is_not_a_number_is_refused(backbone: str) -> None:
         make_model(backbone=backbone).slice_at(replace(make_views()[0], time=math.nan))
 
 
-class TestInsertionIntoADeformationField:
-    def test_with_a_new_field_canonical_space_is_the_world(self) -> None:
-        model = make_model(backbone="deform")
-        points = some_points(6)
-        make_adapter(model).insert(points)
-        assert torch.equal(model.gaussians["positions"][-6:].detach(), points.positions)
+def test_a_new_gaussian_stands_still_and_fades_over_a_fifth_of_the_duration() -> None:
+    rows = (torch.rand(9, 3), torch.rand(9, 3), torch.full((9,), 0.3))
+    model = create(*rows, extent=1.0, duration=1.0, temporal=True)
+    early, late = (model.slice_at(replace(make_views()[0], time=time)) for time in (0.28, 0.32))
+    torch.testing.assert_close(early.means, late.means)
+    torch.testing.assert_close(early.covariances, late.covariances)
+    expected = torch.sigmoid(model.gaussians["opacity_logits"]) * torch.exp(torch.tensor(-0.5 * 0.02**2 / 0.2))
+    torch.testing.assert_close(late.opacities, expected)
 
 
-class TestSlice:
-    def test_a_new_gaussian_stands_still_and_fades_over_a_fifth_of_the_duration(self) -> None:
-        rows = (torch.rand(9, 3), torch.rand(9, 3), torch.full((9,), 0.3))
-        model = create(*rows, extent=1.0, duration=1.0, temporal=True)
-        early, late = (model.slice_at(replace(make_views()[0], time=time)) for time in (0.28, 0.32))
-        torch.testing.assert_close(early.means, late.means)
-        torch.testing.assert_close(early.covariances, late.covariances)
-        expected = torch.sigmoid(model.gaussians["opacity_logits"]) * torch.exp(torch.tensor(-0.5 * 0.02**2 / 0.2))
-        torch.testing.assert_close(late.opacities, expected)
-
-
-class TestInitialScales:
-    def test_is_the_root_mean_square_distance_to_three_neighbours(self) -> None:
-        positions = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3], [50, 0, 0]])
-        expected = math.sqrt((1 + 4 + 9) / 3)
-        assert nearest_neighbour_scales(positions)[0].item() == pytest.approx(expected)
+def test_a_first_scale_is_the_root_mean_square_distance_to_three_neighbours() -> None:
+    positions = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3], [50, 0, 0]])
+    assert nearest_neighbour_scales(positions)[0].item() == pytest.approx(math.sqrt((1 + 4 + 9) / 3))
 
 
 class TestColour:
@@ -239,13 +220,6 @@ class TestColour:
         coefficients[:, 1] = 0.4 / sh.SH_C0
         color = sh.colors(coefficients, torch.ones(1, 3), torch.tensor([1 / 6]), 0, 1)
         torch.testing.assert_close(color, torch.full((1, 3), 0.5 + 0.4 * math.cos(math.pi / 3)))
-
-
-class TestPhotometricLoss:
-    def test_passes_gradcheck(self) -> None:
-        generator = torch.Generator().manual_seed(0)
-        image, target = torch.rand(2, 12, 13, 3, dtype=torch.float64, generator=generator)
-        assert torch.autograd.gradcheck(lambda x: photometric_loss(x, target), image.requires_grad_())
 
 
 class TestDensityControl:

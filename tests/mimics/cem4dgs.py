@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import torch
 from torch import Tensor, nn
 
@@ -26,9 +24,8 @@ MOTION = (("motion_xyz", "_xyz_motion"), ("motion_rotation", "_rotation_motion")
 class GaussianModel(ex4dgs.GaussianModel):
     """Splats of level 0 drift; those of level 1 hang on a motion, whose number in the joint table is their parent."""
 
-    columns = (*STATIC, *MOTION)
-    saved = (*ex4dgs.GaussianModel.kept, "_parent", "_level")
-    rgb = InriaModel.rgb
+    columns, static_columns = (*STATIC, *MOTION), STATIC
+    rgb, rates = InriaModel.rgb, InriaModel.rates
 
     def create_from_pcd(self, points, colors, scale: float = 0.15) -> None:
         InriaModel.create_from_pcd(self, points, colors, scale)
@@ -41,9 +38,6 @@ class GaussianModel(ex4dgs.GaussianModel):
         self._set("_xyz_motion", torch.empty(0, 2, 3))
         self._set("_rotation_motion", torch.empty(0, 2, 4))
         self._parent, self._level = torch.full((count, 1), -1), torch.zeros(count, 1, dtype=torch.long)
-
-    def rates(self, opt: SimpleNamespace) -> dict[str, float]:
-        return InriaModel.rates(self, opt) | dict.fromkeys([name for name, _ in (*STATIC[6:], *MOTION)], 1e-3)
 
     def _joint(self, t: float) -> tuple[Tensor, Tensor]:
         """Positions and rotations of splats and motions together, children carried by their parents."""
@@ -88,15 +82,6 @@ class GaussianModel(ex4dgs.GaussianModel):
         for name in (*self.accumulated, *self.kept, "max_radii2D"):
             setattr(self, name, getattr(self, name)[~static_mask])
 
-    def densification_postfix_onlystatic(
-        self, new_xyz, new_features_dc, new_features_rest, new_opacity, new_scaling, new_rotation, new_xyz_disp,
-        new_opacity_duration_center, new_opacity_duration_var,
-    ) -> None:  # fmt: skip
-        self._added(STATIC, (
-            new_xyz, new_features_dc, new_features_rest, new_opacity, new_scaling, new_rotation, new_xyz_disp,
-            new_opacity_duration_center, new_opacity_duration_var,
-        ))  # fmt: skip
-
     def densify_and_clone(self, grads: Tensor, threshold: float, extent: float) -> None:
         """The errors, parents and levels are lengthened by the caller, splats before motions."""
         chosen, count = grads.norm(dim=-1) >= threshold, len(self._xyz)
@@ -125,9 +110,8 @@ class GaussianModel(ex4dgs.GaussianModel):
         self.cat_tensors_to_optimizer({"motion_xyz": rows, "motion_rotation": identity})
         self._parent[moving, 0] = torch.arange(len(moving)) + first
         self._level[moving] = 1
-        blank = len(moving)
-        self._parent = torch.cat([self._parent, torch.full((blank, 1), -1)])
-        self._level = torch.cat([self._level, torch.zeros(blank, 1, dtype=torch.long)])
+        self._parent = torch.cat([self._parent, torch.full((len(moving), 1), -1)])
+        self._level = torch.cat([self._level, torch.zeros(len(moving), 1, dtype=torch.long)])
         self._xyz.data[moving] = 0.0
         self._xyz_disp.data[moving] = 0.0
 

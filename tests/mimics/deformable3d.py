@@ -7,11 +7,20 @@ from types import SimpleNamespace
 import torch
 from torch import Tensor, nn
 
-from .inria import InriaModel, Scene, cameras_of, default_options, densify, draw_all, l1_loss, shuffled, started
+from .inria import (
+    InriaModel,
+    Scene,
+    cameras_of,
+    default_options,
+    densify,
+    draw_all,
+    l1_loss,
+    restore,
+    shuffled,
+    started,
+)
 
-
-class GaussianModel(InriaModel):
-    """The plain six columns."""
+GaussianModel = InriaModel
 
 
 class DeformNetwork(nn.Module):
@@ -72,13 +81,12 @@ def make(is_6dof: bool = False) -> tuple[GaussianModel, DeformModel, Scene]:
 def training(
     gaussians: GaussianModel, deform: DeformModel, scene: Scene, opt=None, checkpoint=None, stop: int = 10**9
 ) -> SimpleNamespace:
-    """The repository saves no optimizer state, so `checkpoint` is what one would add to resume at all."""
+    """The repository saves no optimizer, so `checkpoint` is what one would add to resume at all."""
     opt, dataset, first_iter = opt or default_options(), SimpleNamespace(white_background=False), 0
     deform.train_setting(opt)
     if checkpoint:
-        (model_params, deform_params, deform_optimizer), first_iter = checkpoint
-        deform.deform.load_state_dict(deform_params)
-        deform.optimizer.load_state_dict(deform_optimizer)
+        (model_params, deform_params), first_iter = checkpoint
+        restore(deform, deform_params)
         gaussians.restore(model_params, opt)  # as many Gaussians as there were, before anything attaches
     gaussians.training_setup(opt)
 
@@ -102,8 +110,6 @@ def training(
         with torch.no_grad():
             gradient = render_pkg_re["viewspace_points_densify"].grad
             densify(gaussians, opt, iteration, gradient, visibility_filter, radii)
-            if iteration < opt.densify_until_iter and iteration % opt.opacity_reset_interval == 0:
-                gaussians.reset_opacity()
             if iteration < opt.iterations:
                 gaussians.optimizer.step()
                 deform.optimizer.step()

@@ -35,10 +35,10 @@ DYNAMIC = (
 class GaussianModel(InriaModel):
     """Two key frames, at the two frames of the tiny scene; the error statistics that select dynamic ones."""
 
-    columns = (*STATIC, *DYNAMIC)
+    columns, static_columns = (*STATIC, *DYNAMIC), STATIC
+    rates = InriaModel.rates | {f"motion_{name}": rate for name, rate in InriaModel.rates.items()} | {"xyz_disp": 2e-2}
     accumulated = ("xyz_gradient_accum", "denom", "xyz_error_accum", "xyz_ssim_error_accum", "error_denom")
     kept = ("xyz_error_min", "xyz_error_min_timestamp", "min_radii2D")
-    saved = kept
     kernel_size, duration, time_shift = 0.1, 1, 1
 
     def create_from_pcd(self, points, colors, scale: float = 0.15) -> None:
@@ -47,10 +47,6 @@ class GaussianModel(InriaModel):
         shapes = ((2, 3), (1, 3), (15, 3), (3,), (1,), (2, 1), (2, 1), (2, 4))
         for (_, attribute), shape in zip(DYNAMIC, shapes):
             self._set(attribute, torch.empty(0, *shape))
-
-    def rates(self, opt: SimpleNamespace) -> dict[str, float]:
-        rates = super().rates(opt) | {"xyz_disp": 2e-2}
-        return rates | {name: rates.get(name.removeprefix("motion_"), 1e-3) for name, _ in DYNAMIC}
 
     def training_setup(self, training_args: SimpleNamespace) -> None:
         super().training_setup(training_args)
@@ -89,6 +85,7 @@ class GaussianModel(InriaModel):
             setattr(self, name, getattr(self, name)[~static_mask])
 
     def _added(self, columns: tuple[tuple[str, str], ...], values: tuple[Tensor, ...]) -> None:
+        assert len(values) == len(columns)
         self.cat_tensors_to_optimizer({name: value for (name, _), value in zip(columns, values)})
         self._zero_accumulators()
         self.max_radii2D = torch.zeros(len(self._xyz))
@@ -98,11 +95,8 @@ class GaussianModel(InriaModel):
         """Raw rows of both tables, in the order of the columns; the errors are the caller's."""
         self._added(self.columns, values)
 
-    def densification_postfix_onlystatic(
-        self, new_xyz, new_features_dc, new_features_rest, new_opacities, new_scaling, new_rotation, new_xyz_disp
-    ) -> None:
-        values = new_xyz, new_features_dc, new_features_rest, new_opacities, new_scaling, new_rotation, new_xyz_disp
-        self._added(STATIC, values)
+    def densification_postfix_onlystatic(self, *values: Tensor) -> None:
+        self._added(self.static_columns, values)
 
     def densify_and_clone(self, grads: Tensor, threshold: float, extent: float) -> None:
         chosen = grads.norm(dim=-1) >= threshold
@@ -148,14 +142,6 @@ class GaussianModel(InriaModel):
         masks = [values.isnan().flatten(1).any(1) for values in (self._xyz, self._xyz_motion)]
         if any(mask.any() for mask in masks):
             self.prune_points(*masks)
-
-    def capture(self) -> tuple[object, ...]:
-        return super().capture(), tuple(getattr(self, name) for name in self.saved)
-
-    def restore(self, model_args: tuple[object, ...], training_args: SimpleNamespace) -> None:
-        super().restore(model_args[0], training_args)
-        for name, value in zip(self.saved, model_args[1]):
-            setattr(self, name, value.clone())
 
 
 _FEATURES = ("_features_dc", "_features_rest")

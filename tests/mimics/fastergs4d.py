@@ -10,9 +10,10 @@ import torch
 from tiny import TinyFrames
 from torch import Tensor, nn
 
+from d2_plugin.protocol import View
 from d2_plugin.rasterizer import RasterSettings, Splats, rasterize
 
-from .inria import SH_C0, initial_points, l1_loss, shuffled
+from .inria import SH_C0, initial_points, l1_loss, restore, shuffled
 
 RATES = {
     "spatial_means": 2e-3, "temporal_means": 2e-3, "sh_coefficients_0": 2e-2, "sh_coefficients_rest": 1e-3,
@@ -96,12 +97,6 @@ class Gaussians(nn.Module):
     def sort(self, ordering: Tensor) -> None:
         self._keep(ordering)
 
-    def reset_opacities(self) -> None:
-        group = next(group for group in self.optimizer.param_groups if group["name"] == "opacities")
-        self._opacities.data = self._opacities.data.clamp_max(-1.0)
-        for key in ("exp_avg", "exp_avg_sq"):
-            self.optimizer.state[group["params"][0]][key].zero_()
-
     def adaptive_density_control(self, grad_threshold: float, min_opacity: float) -> None:
         """Copies of small Gaussians at the end, then one prune of what is faint."""
         info = self._densification_info
@@ -151,9 +146,7 @@ def render_image_training(gaussians: Gaussians, view: NerficgView) -> tuple[Tens
     return out.color.permute(2, 0, 1), (rows, offsets, out)
 
 
-def drawn_view(view: NerficgView):
-    from d2_plugin.protocol import View
-
+def drawn_view(view: NerficgView) -> View:
     lens = view.camera
     K = torch.tensor([[lens.focal_x, 0, lens.center_x], [0, lens.focal_y, lens.center_y], [0, 0, 1]])
     return View("", 0, view.timestamp, view.w2c, K, lens.width, lens.height)
@@ -174,22 +167,14 @@ class Trainer:
         self.model, self.dataset = SimpleNamespace(gaussians=gaussians), dataset
 
     def setup_gaussians(self, saved: dict | None) -> None:
+        """As many Gaussians as there were, before anything attaches; the repository pickles the trainer as a whole."""
         points, colors = initial_points()
         self.model.gaussians.initialize_from_point_cloud(points, colors, 0.0, 0.5)
-        for name, value in (saved["values"] if saved else {}).items():
-            setattr(self.model.gaussians, f"_{name}", nn.Parameter(value.clone()))
-        self.model.gaussians.training_setup()
+        restore(self.model.gaussians, saved or {})
+        if not saved:
+            self.model.gaussians.training_setup()
         self.model.gaussians.reset_densification_info()
 
-    def restore(self, saved: dict) -> None:
-        """Of an own checkpoint: the repository's only pickles the trainer as a whole."""
-        self.model.gaussians.optimizer.load_state_dict(saved["optimizer"])
-        self.model.gaussians._densification_info = saved["info"].clone()
-
-    def capture(self) -> dict[str, object]:
-        g = self.model.gaussians
-        values = {name: getattr(g, f"_{name}").detach().clone() for name in RATES}
-        return {"values": values, "optimizer": g.optimizer.state_dict(), "info": g._densification_info}
 
     def training_iteration(self, iteration: int) -> None:
         order = shuffled(len(self.dataset), iteration + 1)
@@ -211,23 +196,21 @@ class Trainer:
 
     @torch.no_grad()
     def before(self, iteration: int) -> None:
-        """Densification, ordering and opacity reset come before the step of their iteration."""
+        """Densification and ordering come before the step of their iteration."""
         gaussians = self.model.gaussians
         if 10 < iteration < 80 and iteration % 13 == 0:
             gaussians.adaptive_density_control(3e-3, 0.005)
             gaussians.reset_densification_info()
         if iteration and iteration % 20 == 0:
             gaussians.apply_morton_ordering()
-        if iteration == 41:
-            gaussians.reset_opacities()
 
 
 def training(gaussians: Gaussians, dataset, checkpoint=None, stop: int = 10**9) -> SimpleNamespace:
     trainer = Trainer(gaussians, dataset)
-    trainer.setup_gaussians(checkpoint[0] if checkpoint else None)
-    if checkpoint:
-        trainer.restore(checkpoint[0])
-    for iteration in range(checkpoint[1] if checkpoint else 0, min(Trainer.NUM_ITERATIONS, stop)):
+    saved, first = checkpoint or (None, 0)
+    trainer.setup_gaussians(saved)
+    restore(gaussians, saved or {})
+    for iteration in range(first, min(Trainer.NUM_ITERATIONS, stop)):
         trainer.before(iteration)
         trainer.training_iteration(iteration)
     return SimpleNamespace(gaussians=gaussians, trainer=trainer, d2=getattr(trainer, "d2", None))

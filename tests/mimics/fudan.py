@@ -17,6 +17,7 @@ class GaussianModel(InriaModel):
     """gaussian_dim 4 with rot_4d."""
 
     columns = (*InriaModel.columns, ("t", "_t"), ("scaling_t", "_scaling_t"), ("rotation_r", "_rotation_r"))
+    rates = InriaModel.rates | {"t": 2e-3, "scaling_t": 1e-2, "rotation_r": 2e-3}
     accumulated = ("xyz_gradient_accum", "denom", "t_gradient_accum")
 
     def __init__(self, time_duration: tuple[float, float] = (0.0, 0.5)) -> None:
@@ -30,25 +31,12 @@ class GaussianModel(InriaModel):
         self._set("_scaling_t", torch.full((len(points), 1), 0.5 * math.log((stop - start) / 5)))
         self._set("_rotation_r", self._rotation.detach().clone())
 
-    def rates(self, opt: SimpleNamespace) -> dict[str, float]:
-        further = {"t": opt.position_lr_init, "scaling_t": opt.scaling_lr, "rotation_r": opt.rotation_lr}
-        return super().rates(opt) | further
-
-    def densification_postfix(
-        self, new_xyz, new_features_dc, new_features_rest, new_opacities, new_scaling, new_rotation,
-        new_t, new_scaling_t, new_rotation_r,
-    ) -> None:  # fmt: skip
-        self._append((
-            new_xyz, new_features_dc, new_features_rest, new_opacities, new_scaling, new_rotation,
-            new_t, new_scaling_t, new_rotation_r,
-        ))  # fmt: skip
-
 
 class Scene:
     """Cameras by resolution scale, as the repository keeps them."""
 
     def __init__(self, cameras: list[Camera]) -> None:
-        self.train_cameras, self.test_cameras, self.cameras_extent = {1.0: cameras}, {1.0: []}, 2.0
+        self.train_cameras, self.test_cameras = {1.0: cameras}, {1.0: []}
 
     def getTrainCameras(self) -> list[tuple[Tensor, Camera]]:
         return [(camera.original_image, camera) for camera in self.train_cameras[1.0]]
@@ -99,8 +87,6 @@ def training(gaussians: GaussianModel, scene: Scene, opt=None, checkpoint=None, 
         batch_viewspace_point_grad[visibility_filter] *= batch_size / visibility_count[visibility_filter]
         with torch.no_grad():
             densify(gaussians, opt, iteration, batch_viewspace_point_grad.unsqueeze(1), visibility_filter, radii)
-            if iteration < opt.densify_until_iter and iteration % opt.opacity_reset_interval == 0:
-                gaussians.reset_opacity()
             if iteration < opt.iterations:
                 gaussians.optimizer.step()
                 gaussians.optimizer.zero_grad(set_to_none = True)

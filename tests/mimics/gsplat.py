@@ -147,11 +147,7 @@ def training(splats, optimizers, strategy, checkpoint=None, stop: int = 10**9) -
     init_step, frames = 0, TinyFrames()
     strategy_state = strategy.initialize_state(scene_scale=2.0)
     if checkpoint:
-        (params, moments, strategy_state), init_step = checkpoint
-        for name, value in params.items():
-            splats[name] = nn.Parameter(value.detach().clone())
-            optimizers[name].param_groups[0]["params"] = [splats[name]]
-            optimizers[name].load_state_dict(moments[name])
+        (splats, optimizers, strategy_state), init_step = checkpoint
     strategy.check_sanity(splats, optimizers)
     for step in range(init_step + 1, min(100, stop) + 1):
         torch.manual_seed(step)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from types import SimpleNamespace
 
 import torch
@@ -59,17 +58,10 @@ class DynamicStrategy(gsplat.DefaultStrategy):
 
 
 def make() -> tuple[nn.ParameterDict, dict[str, torch.optim.Adam], HexPlaneField, DeformNetwork]:
-    points, colors = (torch.tensor(values, dtype=torch.float32) for values in initial_points())
-    count = len(points)
-    quats = torch.zeros(count, 4)
-    quats[:, 0] = 1
-    params = nn.ParameterDict({
-        "means": nn.Parameter(points),
-        "quats": nn.Parameter(quats),
-        "scales": nn.Parameter(torch.full((count, 3), math.log(0.15))),
-        "opacities": nn.Parameter(torch.zeros(count, 1)),
-        "colors": nn.Parameter(colors.contiguous()),
-    })  # fmt: skip
+    splats, *_ = gsplat.make()
+    params = nn.ParameterDict({name: splats[name] for name in ("means", "quats", "scales")})
+    params["opacities"] = nn.Parameter(torch.zeros(len(splats["means"]), 1))
+    params["colors"] = nn.Parameter(torch.tensor(initial_points()[1], dtype=torch.float32))
     optimizers = {name: torch.optim.Adam([params[name]], lr=rate) for name, rate in RATES.items()}
     return params, optimizers, HexPlaneField(), DeformNetwork()
 
@@ -149,14 +141,7 @@ def training(params, optimizers, hexplane, deform_net, checkpoint=None, stop: in
     strategy = DynamicStrategy()
     state = strategy.initialize_state(scene_scale=1.0, num_gaussians=len(params["means"]))
     if checkpoint:
-        (values, moments, state, nets, net_moments), first = checkpoint
-        for name, value in values.items():
-            params[name] = nn.Parameter(value.detach().clone())
-            optimizers[name].param_groups[0]["params"] = [params[name]]
-            optimizers[name].load_state_dict(moments[name])
-        hexplane.load_state_dict(nets[0])
-        deform_net.load_state_dict(nets[1])
-        hex_optimizer.load_state_dict(net_moments)
+        (params, optimizers, state, hexplane, deform_net, hex_optimizer), first = checkpoint
 
     scheduler = TwoStageScheduler(
         coarse_steps=first,

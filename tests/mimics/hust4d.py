@@ -61,11 +61,9 @@ class GaussianModel(InriaModel):
             {"params": list(field.planes.parameters()), "lr": 1e-2, "name": "grid"},
         ]
 
-    def densification_postfix(
-        self, new_xyz, new_features_dc, new_features_rest, new_opacities, new_scaling, new_rotation,
-        new_deformation_table,
-    ) -> None:  # fmt: skip
-        self._append((new_xyz, new_features_dc, new_features_rest, new_opacities, new_scaling, new_rotation))
+    def densification_postfix(self, *values: Tensor) -> None:
+        *rows, new_deformation_table = values
+        super().densification_postfix(*rows)
         self._deformation_table = torch.cat([self._deformation_table, new_deformation_table], -1)
 
     def rows_of(self, mask: Tensor, repeat: int = 1) -> list[Tensor]:
@@ -75,14 +73,6 @@ class GaussianModel(InriaModel):
         super().prune_points(mask)
         self._deformation_accum = self._deformation_accum[~mask]
         self._deformation_table = self._deformation_table[~mask]
-
-    def capture(self) -> tuple[object, ...]:
-        return super().capture(), self._deformation.state_dict(), self._deformation_table
-
-    def restore(self, model_args: tuple[object, ...], training_args: SimpleNamespace) -> None:
-        model_args, field, self._deformation_table = model_args
-        self._deformation.load_state_dict(field)
-        super().restore(model_args, training_args)
 
 
 class Scene(inria.Scene):

@@ -6,6 +6,7 @@ import copy
 import math
 from collections.abc import Mapping
 from types import SimpleNamespace
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -35,8 +36,6 @@ class Camera:
         self.world_view_transform = view.T_camera_world.T.clone()
         self.projection_matrix = projection.T.clone()
         self.full_proj_transform = self.world_view_transform @ self.projection_matrix
-        self.camera_center = self.world_view_transform.inverse()[3, :3]
-        self.T = self.world_view_transform[3, :3].numpy()
         self.original_image = image.permute(2, 0, 1).clone()
         self.image_name, self.image_path = f"{view.camera}_{view.frame:04d}", None
         vars(self).update(extra)
@@ -66,10 +65,9 @@ def cameras_of(**extra) -> list[Camera]:
 def default_options(**changed: object) -> SimpleNamespace:
     """Options with the names of arguments/__init__.py, scheduled for a hundred iterations."""
     options = {
-        "iterations": 100, "percent_dense": 0.01, "position_lr_init": 2e-3, "feature_lr": 2e-2, "opacity_lr": 5e-2,
-        "scaling_lr": 1e-2, "rotation_lr": 2e-3, "densify_from_iter": 10, "densify_until_iter": 80,
-        "densification_interval": 13, "densify_grad_threshold": 3e-3, "opacity_reset_interval": 41,
-        "batch_size": 2, "warm_up": 30,
+        "iterations": 100, "percent_dense": 0.01, "position_lr_init": 2e-3, "densify_from_iter": 10,
+        "densify_until_iter": 80, "densification_interval": 13, "densify_grad_threshold": 3e-3, "batch_size": 2,
+        "warm_up": 30,
     }  # fmt: skip
     return SimpleNamespace(**(options | changed))
 
@@ -141,11 +139,15 @@ class InriaModel:
         ("scaling", "_scaling"),
         ("rotation", "_rotation"),
     )
+    rates: ClassVar[dict[str, float]] = {
+        "xyz": 2e-3, "f_dc": 2e-2, "f_rest": 1e-3, "opacity": 5e-2, "scaling": 1e-2, "rotation": 2e-3,
+    }  # fmt: skip
+    """Of learning; a thousandth for the others."""
     accumulated = ("xyz_gradient_accum", "denom")
     xyz_column, scaling_column = 0, 4
 
     def __init__(self) -> None:
-        self.optimizer, self.percent_dense, self.spatial_lr_scale = None, 0, 1.0
+        self.optimizer, self.percent_dense = None, 0
         self.max_radii2D = torch.empty(0)
 
     def create_from_pcd(self, points: np.ndarray, colors: np.ndarray, scale: float = 0.15) -> None:
@@ -179,17 +181,11 @@ class InriaModel:
     def rgb(self) -> Tensor:
         return (0.5 + SH_C0 * self._features_dc[:, 0] + 0 * self._features_rest.sum((1, 2))[:, None]).clamp_min(0)
 
-    def rates(self, opt: SimpleNamespace) -> dict[str, float]:
-        return {
-            "xyz": opt.position_lr_init, "f_dc": opt.feature_lr, "f_rest": opt.feature_lr / 20,
-            "opacity": opt.opacity_lr, "scaling": opt.scaling_lr, "rotation": opt.rotation_lr,
-        }  # fmt: skip
-
     def training_setup(self, training_args: SimpleNamespace) -> None:
         self.percent_dense = training_args.percent_dense
         self._zero_accumulators()
-        rates = self.rates(training_args)
-        groups = [{"params": [getattr(self, a)], "lr": rates[name], "name": name} for name, a in self.columns]
+        named = ((name, getattr(self, attribute)) for name, attribute in self.columns)
+        groups = [{"params": [value], "lr": self.rates.get(name, 1e-3), "name": name} for name, value in named]
         self.optimizer = torch.optim.Adam(groups + self.further_groups(training_args), lr=0.0, eps=1e-15)
 
     def further_groups(self, opt: SimpleNamespace) -> list[dict[str, object]]:
@@ -227,13 +223,9 @@ class InriaModel:
                 padded = {key: torch.cat([value, torch.zeros_like(rows)]) for key, value in moments.items()}
                 self._swap(group, torch.cat([group["params"][0], rows]), padded)
 
-    def densification_postfix(
-        self, new_xyz, new_features_dc, new_features_rest, new_opacities, new_scaling, new_rotation
-    ) -> None:
-        self._append((new_xyz, new_features_dc, new_features_rest, new_opacities, new_scaling, new_rotation))
-
-    def _append(self, values: tuple[Tensor | None, ...]) -> None:
-        """The evidence of every Gaussian is erased, as in all these repositories."""
+    def densification_postfix(self, *values: Tensor) -> None:
+        """Raw rows in the order of `columns`; erases the evidence of every Gaussian, as all these repositories do."""
+        assert len(values) == len(self.columns)
         self.cat_tensors_to_optimizer({name: value for (name, _), value in zip(self.columns, values)})
         self._zero_accumulators()
         self.max_radii2D = torch.zeros(len(self._xyz))
@@ -264,44 +256,39 @@ class InriaModel:
         grads[grads.isnan()] = 0.0
         self.densify_and_clone(grads, max_grad, extent)
         self.densify_and_split(grads, max_grad, extent)
-        mask = (self.get_opacity < min_opacity).squeeze()
-        if max_screen_size:
-            mask = mask | (self.max_radii2D > max_screen_size) | (self.get_scaling.amax(1) > 0.1 * extent)
-        self.prune_points(mask)
+        self.prune_points((self.get_opacity < min_opacity).squeeze())
 
     def add_densification_stats(self, gradient: Tensor, update_filter: Tensor) -> None:
         self.xyz_gradient_accum[update_filter] += gradient[update_filter, :2].norm(dim=-1, keepdim=True)
         self.denom[update_filter] += 1
 
-    def reset_opacity(self) -> None:
-        for group, moments in self._each_column():
-            if group["name"] == "opacity":
-                value = torch.logit(self.get_opacity.clamp(max=0.3))
-                self._swap(group, value, {key: torch.zeros_like(value) for key in moments})
-
-    def capture(self) -> tuple[object, ...]:
-        values = tuple(getattr(self, attribute) for _, attribute in self.columns)
-        evidence = tuple(getattr(self, name) for name in (*self.accumulated, "max_radii2D"))
-        return values, evidence, self.optimizer.state_dict()
-
-    def restore(self, model_args: tuple[object, ...], training_args: SimpleNamespace) -> None:
-        values, evidence, opt_dict = model_args
-        for (_, attribute), value in zip(self.columns, values):
-            self._set(attribute, value.detach().clone())
-        self.training_setup(training_args)
-        for name, value in zip((*self.accumulated, "max_radii2D"), evidence):
-            setattr(self, name, value.clone())
-        self.optimizer.load_state_dict(opt_dict)
+    def restore(self, model_args: Mapping[str, object], training_args: SimpleNamespace) -> None:
+        """From what `kept` returned; the repositories' checkpoints are tuples, some too small to go on from."""
+        restore(self, model_args)
 
 
 class Scene:
-    cameras_extent = 2.0
-
     def __init__(self, cameras: list[Camera]) -> None:
         self.cameras = cameras
 
     def getTrainCameras(self) -> list[Camera]:
         return self.cameras
+
+
+def kept(model: object) -> dict[str, object]:
+    """What a model needs to go on: tensors, fields and optimizers that belong together, as they are at this moment."""
+    values = vars(model) | vars(model).get("_parameters", {})
+    own = {name: value for name, value in values.items() if isinstance(value, (Tensor, nn.Module, torch.optim.Adam))}
+    copies = copy.deepcopy({name: value for name, value in own.items() if getattr(value, "grad_fn", None) is None})
+    for value in copies.values():
+        if isinstance(value, nn.Module):
+            value._forward_hooks.clear()  # of an adapter
+    return copies
+
+
+def restore(model: object, saved: Mapping[str, object]) -> None:
+    for name, value in copy.deepcopy(saved).items():
+        setattr(model, name, value)
 
 
 def densify(gaussians, opt, iteration: int, gradient: Tensor, seen: Tensor, radii: Tensor, faint=0.005) -> None:
@@ -329,5 +316,3 @@ def started(gaussians: InriaModel) -> InriaModel:
 def shuffled(count: int, epoch: int) -> list[int]:
     """A new order for every epoch, without the global random state: a resumed run goes on with the same one."""
     return np.random.default_rng(epoch).permutation(count).tolist()
-
-

@@ -41,19 +41,6 @@ class GaussianModel(InriaModel):
     def get_rotation(self, delta_t: Tensor) -> Tensor:
         return nn.functional.normalize(self._rotation + delta_t * self._omega)
 
-    def rates(self, opt: SimpleNamespace) -> dict[str, float]:
-        further = ("trbf_center", "trbf_scale", "motion", "omega", "f_t")
-        return super().rates(opt) | dict.fromkeys(further, 1e-3)
-
-    def densification_postfix(
-        self, new_xyz, new_features_dc, new_opacities, new_scaling, new_rotation, new_trbf_center, new_trbfscale,
-        new_motion, new_omega, new_featuret,
-    ) -> None:  # fmt: skip
-        self._append((
-            new_xyz, new_features_dc, new_opacities, new_scaling, new_rotation, new_trbf_center, new_trbfscale,
-            new_motion, new_omega, new_featuret,
-        ))  # fmt: skip
-
     def prune_points(self, mask: Tensor) -> None:
         super().prune_points(mask)
         if self.omegamask is not None:
@@ -121,10 +108,6 @@ def training(gaussians: GaussianModel, scene: Scene, opt=None, checkpoint=None, 
         with torch.no_grad():
             seen, radii = render_pkg["visibility_filter"], render_pkg["radii"]
             densify(gaussians, opt, iteration, render_pkg["viewspace_points"].grad, seen, radii)
-            if iteration == 80:
-                gaussians.omegamask = torch.ones(len(gaussians._xyz), 1, dtype=torch.bool)
-            if iteration >= 80 and gaussians._omega.grad is not None:
-                gaussians._omega.grad *= gaussians.omegamask
             if iteration < opt.iterations:
                 gaussians.optimizer.step()
                 gaussians.optimizer.zero_grad(set_to_none = True)

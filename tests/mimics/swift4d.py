@@ -56,12 +56,10 @@ class GaussianModel(InriaModel):
         self._dynamic = nn.Parameter(value)
         self.dy_optimizer.param_groups[0]["params"] = [self._dynamic]
 
-    def densification_postfix(
-        self, new_dynamic, new_xyz, new_features_dc, new_features_rest, new_opacities, new_scaling, new_rotation,
-        new_max_weight,
-    ) -> None:  # fmt: skip
+    def densification_postfix(self, *values: Tensor) -> None:
+        new_dynamic, *rows, new_max_weight = values
         self._set_dynamic(torch.cat([self._dynamic.detach(), new_dynamic]))
-        self._append((new_xyz, new_features_dc, new_features_rest, new_opacities, new_scaling, new_rotation))
+        super().densification_postfix(*rows)
         self._max_weight = torch.cat([self._max_weight, new_max_weight])
 
     def rows_of(self, mask: Tensor, repeat: int = 1) -> list[Tensor]:
@@ -77,18 +75,6 @@ class GaussianModel(InriaModel):
     def weight_prune(self, weight_threshold: float) -> None:
         self.prune_points(self._max_weight < weight_threshold)
         self._max_weight = self._max_weight * 0.0
-
-    def capture(self) -> tuple[object, ...]:
-        """With what the repository's own leaves out: without logits and field nothing could go on."""
-        field = self._FDhash.state_dict(), self.hash_optimizer.state_dict()
-        return super().capture(), self._dynamic.detach().clone(), self._max_weight.clone(), field
-
-    def restore(self, model_args: tuple[object, ...], training_args: SimpleNamespace) -> None:
-        model_args, dynamic, self._max_weight, (field, moments) = model_args
-        self._dynamic = nn.Parameter(dynamic.clone())
-        super().restore(model_args, training_args)
-        self._FDhash.load_state_dict(field)
-        self.hash_optimizer.load_state_dict(moments)
 
 
 def render(viewpoint_camera, pc, bg_color, stage="fine") -> dict[str, Tensor]:
