@@ -20,7 +20,7 @@ from d2_plugin.settings import Count, Every, Positive, Range, Share, Steps
 log = logging.getLogger(__name__)
 
 AT_LEAST = 5
-"""Steps from one evaluation to the next in a short run: an evaluation costs as much as several steps."""
+"""Steps from one evaluation to the next in the shortest runs."""
 
 SIGMAS = 2.5
 """A pixel also counts as under-reconstructed only beyond this many standard deviations of its depth."""

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from tiny import ALL_HOOKS, HEIGHT, WIDTH, TinyStore, make_adapter, make_model, make_views
 
 from d2_plugin import hooks
-from d2_plugin.config import DensifyConfig
+from d2_plugin.config import DensifyConfig, MotionConfig, PruneConfig
 from d2_plugin.hooks.densify import Densify, back_project
 from d2_plugin.hooks.hook import Context, Window
 from d2_plugin.hooks.prior import PriorLoader
@@ -113,6 +113,18 @@ def test_the_first_evaluation_looks_through_every_camera_seen_so_far() -> None:
 def test_a_window_is_due_at_its_start_and_every_so_often_until_its_stop(start: int, every: int, length: int) -> None:
     window = Window(start, start + length, every)
     assert [step for step in range(120) if window.due(step)] == [*range(start, start + length, every)]
+
+
+@pytest.mark.parametrize("iterations", [1, 20, 40, 110, 500, 2000, 30_000])
+def test_a_schedule_inserts_early_and_leaves_half_of_the_run_to_train(iterations: int) -> None:
+    """In a short run holes close, and what is misplaced moves, at a pace that counts iterations, not parts of the run;
+    and an evaluation costs as much as several steps."""
+    insert, remove = DensifyConfig.for_iterations(iterations), PruneConfig.for_iterations(iterations)
+    assert insert.start <= max(1, iterations / 40)
+    assert insert.start < insert.stop <= iterations / 2 + insert.every + 1
+    assert remove.every >= 10
+    assert insert.every >= min(10, iterations / 10)
+    assert MotionConfig.for_iterations(iterations).start == max(1, iterations // 3)
 
 
 FILE_OF_THE_HOOK = """

@@ -109,6 +109,13 @@ class TestRegions:
         matched = self.matched(shown(self.start, large), shown(self.end, ball(60, 57, 10)))
         assert {tuple(np.round(shift, -1)) for shift in matched} == {(30, -10), (-30, 0)}
 
+    def test_what_is_half_hidden_at_the_end_is_matched_or_left_out(self) -> None:
+        hidden = self.end & (np.mgrid[:HEIGHT, :WIDTH][1] < 62)
+        assert all(np.abs(shift - (32, -10)).max() <= 3 for shift in self.matched(shown(self.start), shown(hidden)))
+
+    def test_nothing_moves_where_nothing_changes(self) -> None:
+        assert not self.matched(shown(self.start), shown(self.start))
+
 
 class TestFlights:
     def flights(self, count: int = 6) -> list[Flight]:

@@ -239,7 +239,11 @@ def spoilt_confidence(arrays: dict[str, np.ndarray], frame: int) -> None:
     arrays["conf"][:] = 0
 
 
-@pytest.mark.parametrize("spoilt", [spoilt_noise, spoilt_views, spoilt_confidence])
+def spoilt_sky(arrays: dict[str, np.ndarray], frame: int) -> None:
+    arrays["depth"][:] = np.inf
+
+
+@pytest.mark.parametrize("spoilt", [spoilt_noise, spoilt_views, spoilt_confidence, spoilt_sky])
 def test_a_source_that_shows_nothing_leaves_the_prior_as_it_is_or_nearly(
     room: Recording, without: PriorStore, tmp_path: Path, spoilt: Callable
 ) -> None:
