@@ -266,15 +266,6 @@ def test_inputs_need_not_be_contiguous_and_gradients_may_be_expanded(kernels: Pa
     assert all(torch.equal(part.grad, other.grad) for part, other in zip(strided[:4], plain[:4]))
 
 
-def test_only_what_requires_gradients_gets_one(kernels: Path) -> None:
-    scene = random_scene(11, 50, 20, 20).on(kernels)
-    assert not scene.render().color.requires_grad
-    scene.opacities.requires_grad_()
-    scene.render().alpha.sum().backward()
-    assert scene.opacities.grad is not None
-    assert scene.means.grad is None
-
-
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 def test_torch_compile_leaves_it_as_it_is() -> None:

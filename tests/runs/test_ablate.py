@@ -117,7 +117,7 @@ def test_the_command_trains_shares_priors_and_repeats_nothing(
     recording = synthetic_recording(cameras=2, held_out=1, frames=2, width=96, height=54)
     path = save_recording(recording, tmp_path / "recordings" / "room")
     command = ["ablate", str(path), "--train-cameras", "train0,train1", "--rows", "main,no_pruning"]
-    command += ["--seeds", "3", "--iterations", "8", "--jobs", "1", "--output", str(tmp_path / "out")]
+    command += ["--seeds", "3", "--iterations", "20", "--jobs", "1", "--output", str(tmp_path / "out")]
     assert main(command) == 0
     table = (tmp_path / "out" / "ablation.md").read_text()
     assert "| Backbone |" in table
@@ -132,5 +132,5 @@ def test_the_command_trains_shares_priors_and_repeats_nothing(
     assert main(command) == 0
     assert {path: path.stat().st_mtime_ns for path in checkpoints} == checkpoints
     capsys.readouterr()
-    assert main([*command, "--iterations", "9"]) == 2
+    assert main([*command, "--iterations", "21"]) == 2
     assert "another run" in capsys.readouterr().err
