@@ -70,14 +70,13 @@ def test_bins_of_a_few_pixels_and_a_sigma_of_zero_have_no_mark() -> None:
 
 def test_a_rendered_rig_is_measured_without_any_data_and_drawn(tmp_path: Path) -> None:
     output = tmp_path / "rows.jsonl"
-    told = run(PriorsBench(rigs=("synthetic2",), width=96, frames=(0,), output=output))
+    told = run(PriorsBench(rigs=("synthetic4",), width=96, frames=(0,), output=output))
     rows = read_rows([output])
-    assert "synthetic2, 2 views" in told
-    assert "held against the true depth of 2 views" in told
+    assert "synthetic4, 4 views" in told
+    assert "held against the true depth of 4 views" in told
     assert {row["kind"] for row in rows} == {"priors"}
     *labels, far, motion = rows
-    assert [row["method"] for row in rows] == [*(row["method"] for row in labels), "far", "motion"]
-    assert {"verified", "mono only"} <= {row["method"] for row in labels}
+    assert [row["method"] for row in rows] == ["verified", "agreed", "mono only", "far", "motion"]
     for row in labels:
         assert row["error"] == pytest.approx(abs(row["within"] - NORMAL_SHARE))
         assert 0 < row["share"] < 1
@@ -85,15 +84,19 @@ def test_a_rendered_rig_is_measured_without_any_data_and_drawn(tmp_path: Path) -
         assert row["mono_emulated"]
         assert all(len(point) == 3 for point in row["curve"])
     assert far["error"] == far["false_far"]
-    assert 0 < motion["motion_right"] < 1
+    assert 0.2 < motion["motion_right"] < motion["motion_known"] < 1
+    assert motion["motion_psnr"] > 15
     assert 0 < motion["motion_within"] < motion["motion_within_two"] < 1
-    line = "python -m benchmarks priors --rigs synthetic2 --frames 0 --width 96 --output rows.jsonl"
+    line = "python -m benchmarks priors --rigs synthetic4 --frames 0 --width 96 --output rows.jsonl"
     assert rows[0]["command"] == line, "no folder of this machine"
     make_report(rows, tmp_path, builders={"priors": priors})
     svg, text = (tmp_path / "priors.svg").read_text(), (tmp_path / "report.md").read_text()
     assert svg.count(" pixels</title>") == sum(len(row["curve"]) for row in labels) > 0
     assert DIAGONAL in svg
+    assert "true error, 68 % quantile" in svg
+    assert "| synthetic4, 4 views | mono only |" in text
     assert "emulated, not predicted" in text
+    assert "What moves: scene flow, and what lies between two instants" in text
 
 
 def test_frames_with_truth_are_those_of_any_of_the_cameras(tmp_path: Path) -> None:
