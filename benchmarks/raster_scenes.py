@@ -44,7 +44,7 @@ class Scene(NamedTuple):
 
     def leaves(self, dtype: torch.dtype, device: torch.device | str = "cpu") -> Self:
         """The same in a precision on a device, with tensors that require gradients."""
-        return type(self)(*(part.to(device, dtype).detach().requires_grad_() for part in self[:4]), self.view)
+        return type(self)._make([*(part.to(device, dtype).detach().requires_grad_() for part in self[:4]), self.view])
 
 
 def load_scene(name: str, width: int, height: int, garden: Path | None = None) -> Scene:
@@ -129,4 +129,4 @@ def _view(T_camera_world: np.ndarray, focal_x: float, focal_y: float, width: int
 def _scene(view: View, means: np.ndarray, factors: np.ndarray, *more: np.ndarray) -> Scene:
     covariances = covariances_from_factors(torch.from_numpy(factors).permute(1, 2, 0)).numpy()
     parts = (torch.from_numpy(np.asarray(part, np.float32)) for part in (means, covariances, *more))
-    return Scene(*parts, view)
+    return Scene._make([*parts, view])

@@ -25,7 +25,7 @@ THRESHOLDS = RasterSettings(alpha_min=1e-12, transmittance_min=1e-12)
 def render(scene: Scene, dtype: torch.dtype, near: float = 0.2) -> Render:
     """The image in a precision; covariances were made in float64 and are rounded once."""
     settings = RasterSettings(near, alpha_min=THRESHOLDS.alpha_min, transmittance_min=THRESHOLDS.transmittance_min)
-    rounded = Scene(*(part.to(dtype) for part in scene[:4]), scene.view)
+    rounded = Scene._make([*(part.to(dtype) for part in scene[:4]), scene.view])
     return rasterize(rounded.splats(), rounded.colors, scene.view, settings)
 
 
