@@ -25,9 +25,6 @@ PARTS = {
     ),
     "stereo": ModuleCommand("benchmarks.stereo", "StereoBench", "geometric depth: matchers and settings"),
     "trainers": ModuleCommand("benchmarks.trainers.bench", "TrainersBench", "official trainers bare and attached"),
-    "training-step": ModuleCommand(
-        "benchmarks.training_step", "TrainingStepBench", "one optimizer step beside the rasterizer's part"
-    ),
 }
 """Every part by name; none is imported before it is asked for."""
 

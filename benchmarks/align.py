@@ -10,11 +10,11 @@ from typing import Annotated, Any, NamedTuple, get_args
 import torch
 
 from benchmarks.align_measure import AlignMethod, AlignProblem, align_problem, measure, methods
-from benchmarks.rows import begin_rows
+from benchmarks.rows import begin_rows, grouped, told
 from d2_plugin.errors import D2Error, refuse_unknown
 from d2_plugin.recordings.recording import MonoKind
 from d2_plugin.runs.rows import Row, append_rows, command_line, make_row
-from d2_plugin.runs.tables import Table, markdown
+from d2_plugin.runs.tables import Table
 from d2_plugin.settings import AtATime, NotNegative, Range, Settings, Share
 
 logger = logging.getLogger(__name__)
@@ -74,8 +74,7 @@ def run(settings: AlignBench) -> str:
         append_rows(settings.output, measured)
         rows += measured
         logger.info("%s is measured", case)
-    shown = [part for title, table in tables(rows) for part in (title, markdown(table))]
-    return "\n\n".join([CAPTION, *shown, f"rows are in {settings.output}"])
+    return told(tables(rows), settings.output, CAPTION)
 
 
 def _row(method: AlignMethod, case: AlignCase, problems: list[AlignProblem], budget: float, command: str) -> Row:
@@ -99,20 +98,15 @@ def tables(rows: Sequence[Row]) -> list[tuple[str, Table]]:
     header = ("method", "setting", *(f"{share:.0%} wrong" for share in shares), "worst gap")
     header += tuple(f"{count} anchors, ms" for count in counts)
     made = []
-    for kind in dict.fromkeys(row["domain"] for row in rows):
-        mine = [row for row in rows if row["domain"] == kind]
-        lines = tuple(_cells(key, group, shares, counts) for key, group in _by_setting(mine).items())
+    for (kind,), mine in grouped(rows, "domain").items():
+        groups = grouped(mine, "method", "setting").items()
+        lines = tuple(_cells(key, group, shares, counts) for key, group in groups)
         made.append((f"{kind.capitalize()} map", Table(header, lines)))
     return made
 
 
-def _by_setting(rows: Sequence[Row]) -> dict[tuple[str, str], list[Row]]:
-    keys = dict.fromkeys((row["method"], row["setting"]) for row in rows)
-    return {key: [row for row in rows if (row["method"], row["setting"]) == key] for key in keys}
-
-
 def _cells(
-    key: tuple[str, str], group: Sequence[Row], shares: Sequence[float], counts: Sequence[int]
+    key: tuple[str, ...], group: Sequence[Row], shares: Sequence[float], counts: Sequence[int]
 ) -> tuple[str, ...]:
     """One line of the table; cases that the method refused are counted apart."""
     errors = [_depth_error([row for row in group if row["outliers"] == share]) for share in shares]

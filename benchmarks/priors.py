@@ -18,7 +18,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 import torch
 
 from benchmarks.priors_motion import motion_errors
-from benchmarks.rows import begin_rows
+from benchmarks.rows import begin_rows, told
 from benchmarks.stereo_rigs import ARCS
 from d2_plugin.errors import D2Error, refuse_unknown
 from d2_plugin.priors.build import build_priors
@@ -106,7 +106,7 @@ def run(settings: PriorsBench) -> str:
             )
         append_rows(settings.output, rows)
         logger.info("the prior of %s is measured", case.name)
-    return "\n\n".join([*shown_text, f"rows are in {settings.output}; `python -m benchmarks report` draws them"])
+    return told([], settings.output, *shown_text)
 
 
 def cases(settings: PriorsBench) -> list[Case]:

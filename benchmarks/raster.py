@@ -17,11 +17,11 @@ from benchmarks.raster_measure import (
     peak_memory,
     timed,
 )
-from benchmarks.rows import begin_rows
+from benchmarks.rows import begin_rows, told
 from d2_plugin.errors import D2Error
 from d2_plugin.recordings.checks.memory import BYTES_PER_PIXEL, check_bytes
 from d2_plugin.runs.rows import Row, append_rows, command_line, make_row
-from d2_plugin.runs.tables import Table, markdown
+from d2_plugin.runs.tables import Table
 from d2_plugin.settings import AtATime, Count, NotNegative, Settings
 
 logger = logging.getLogger(__name__)
@@ -65,7 +65,7 @@ def run(settings: RasterBench) -> str:
         measured = _measure(case, settings, command)
         append_rows(settings.output, measured)
         rows += measured
-    return "\n\n".join([CAPTION, markdown(table(rows)), f"rows are in {settings.output}"])
+    return told(tables(rows), settings.output, CAPTION)
 
 
 def parse_size(text: str) -> tuple[int, int]:
@@ -115,11 +115,11 @@ CAPTION = (
 )
 
 
-def table(rows: Sequence[Row]) -> Table:
+def tables(rows: Sequence[Row]) -> list[tuple[str, Table]]:
     """Times, memory and errors per case."""
     header = ("implementation", "scene", "size", *(f"{kind} ms" for kind in PASSES), "CPU ms", "peak MB")
     header += ("color p99.9", "color max", "pixels apart", "worst gradient")
-    return Table(header, tuple(map(_cells, rows)))
+    return [("Every scene and size", Table(header, tuple(map(_cells, rows))))]
 
 
 def _cells(row: Row) -> tuple[str, ...]:

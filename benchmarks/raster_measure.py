@@ -36,26 +36,25 @@ class Case(NamedTuple):
         return load_scene(self.scene, self.width, self.height, self.garden)
 
 
-RenderScene = Callable[[Splats, Tensor, Scene], Render]
+RenderScene = Callable[[Scene], Render]
 
 
-def _d2(splats: Splats, colors: Tensor, scene: Scene) -> Render:
-    return rasterize(splats, colors, scene.view, SETTINGS)
+def _d2(scene: Scene) -> Render:
+    return rasterize(scene.splats(), scene.colors, scene.view, SETTINGS)
 
 
-def _reference(splats: Splats, colors: Tensor, scene: Scene) -> Render:
-    return reference.rasterize(splats, colors, scene.view, SETTINGS)
+def _reference(scene: Scene) -> Render:
+    return reference.rasterize(scene.splats(), scene.colors, scene.view, SETTINGS)
 
 
-def _gsplat(splats: Splats, colors: Tensor, scene: Scene) -> Render:
+def _gsplat(scene: Scene) -> Render:
     """gsplat from covariances, with the same constants; its tiles cut at 3 sigma, so its error is not only rounding."""
     import gsplat
 
-    view, device = scene.view, colors.device
-    xx, xy, xz, yy, yz, zz = splats.covariances.unbind(-1)
-    full = torch.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], -1).reshape(-1, 3, 3)
+    view, device = scene.view, scene.colors.device
+    full = scene.covariances[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
     image, alpha, _ = gsplat.rasterization(
-        *(splats.means, None, None, splats.opacities, colors),
+        *(scene.means, None, None, scene.opacities, scene.colors),
         *(view.T_camera_world.to(device)[None], view.K.to(device)[None], view.width, view.height),
         near_plane=SETTINGS.near,
         eps2d=SETTINGS.blur,
@@ -75,24 +74,10 @@ def implementations(device: torch.device, gaussians: int) -> dict[str, RenderSce
     return found
 
 
-def leaves_of(scene: Scene, device: torch.device, dtype: torch.dtype) -> list[Tensor]:
-    """Means, covariances, opacities and colors that require gradients."""
-    parts = (*scene.splats()[:3], scene.colors)
-    return [part.to(device, dtype).requires_grad_() for part in parts]
-
-
-def splats_of(leaves: Sequence[Tensor]) -> Splats:
-    """The Gaussians of `leaves_of`, without their colors."""
-    means, covariances, opacities, _ = leaves
-    return Splats(means, covariances, opacities, torch.arange(len(means), device=means.device))
-
-
-def upstream(height: int, width: int, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def upstream(scene: Scene) -> list[Tensor]:
     """Fixed random gradients of color, depth sum and alpha."""
-    g = torch.Generator().manual_seed(0)
-    size = (height, width)
-    color, depth, alpha = (torch.randn(shape, generator=g).to(like) for shape in ((*size, 3), size, size))
-    return color, depth, alpha
+    g, size = torch.Generator().manual_seed(0), (scene.view.height, scene.view.width)
+    return [torch.randn(shape, generator=g).to(scene.means) for shape in ((*size, 3), size, size)]
 
 
 def prior_of(scene: Scene, device: torch.device) -> DepthPrior:
@@ -105,18 +90,15 @@ def prior_of(scene: Scene, device: torch.device) -> DepthPrior:
 
 def passes_of(render: RenderScene, scene: Scene, device: torch.device) -> dict[str, Callable[[], object]]:
     """What is timed: forward, forward and backward (gradients of everything for all three outputs), survey."""
-    leaves = leaves_of(scene, device, torch.float32)
-    splats = splats_of(leaves)
-    fixed = splats_of([leaf.detach() for leaf in leaves])
-    weights = upstream(scene.view.height, scene.view.width, leaves[0])
-    prior = prior_of(scene, device)
+    leaves, prior = scene.leaves(torch.float32, device), prior_of(scene, device)
+    fixed, weights = Splats(*(part.detach() for part in leaves.splats())), upstream(leaves)
 
     def forward() -> object:
         with torch.no_grad():
-            return render(fixed, leaves[3], scene)
+            return render(leaves)
 
     def forward_backward() -> object:
-        return torch.autograd.grad(render(splats, leaves[3], scene)[:3], leaves, weights)
+        return torch.autograd.grad(render(leaves)[:3], leaves[:4], weights)
 
     passes = {"forward": forward, "forward+backward": forward_backward}
     if render is _d2:
@@ -164,14 +146,13 @@ class Truth(NamedTuple):
     """The reference in float64, with its graph, for `error_of`."""
 
     render: Render
-    leaves: list[Tensor]
+    scene: Scene
 
 
 def exact(scene: Scene) -> Truth:
     """Image of the reference in float64."""
-    leaves = leaves_of(scene, torch.device("cpu"), torch.float64)
-    splats = splats_of(leaves)
-    return Truth(reference.rasterize(splats, leaves[3], scene.view, SETTINGS), leaves)
+    leaves = scene.leaves(torch.float64)
+    return Truth(_reference(leaves), leaves)
 
 
 def error_of(render: RenderScene, scene: Scene, device: torch.device, truth: Truth) -> dict[str, dict[str, float]]:
@@ -182,16 +163,15 @@ def error_of(render: RenderScene, scene: Scene, device: torch.device, truth: Tru
     and gradients (`relative_l2` is the norm of their deviation over that of the truth) are those of a loss that leaves
     out the pixels whose color or alpha deviates by more than `THRESHOLD_DEVIATION`, whose share is in `apart`.
     """
-    leaves = leaves_of(scene, device, torch.float32)
-    found = render(splats_of(leaves), leaves[3], scene)
+    leaves = scene.leaves(torch.float32, device)
+    found = render(leaves)
     pairs = zip(found[:3], truth.render[:3])
     deviations = [(part.detach().cpu().double() - true.detach()).abs() for part, true in pairs]
     apart = (deviations[0].amax(-1) > THRESHOLD_DEVIATION) | (deviations[2] > THRESHOLD_DEVIATION)
     kept = (~apart[..., None], ~apart, ~apart)
-    given = upstream(scene.view.height, scene.view.width, scene.means)
-    weights = [torch.where(keep, weight, 0) for keep, weight in zip(kept, given)]
-    gradients = torch.autograd.grad(found[:3], leaves, [w.to(device) for w in weights])
-    expected = torch.autograd.grad(truth.render[:3], truth.leaves, [w.double() for w in weights], retain_graph=True)
+    weights = [torch.where(keep, weight, 0) for keep, weight in zip(kept, upstream(scene))]
+    gradients = torch.autograd.grad(found[:3], leaves[:4], [w.to(device) for w in weights])
+    expected = torch.autograd.grad(truth.render[:3], truth.scene[:4], [w.double() for w in weights], retain_graph=True)
     errors = {
         name: {**_quantiles(deviation), "over_1e-4": (deviation > 1e-4).double().mean().item()}
         for name, deviation in zip(Render._fields, deviations)

@@ -5,7 +5,7 @@ Both are seeded and independent of the image size up to the camera, so that time
 
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 import torch
@@ -13,7 +13,7 @@ from torch import Tensor
 
 from d2_plugin.arrays import read_array
 from d2_plugin.errors import D2Error
-from d2_plugin.gaussians.rotation4d import rotation_matrices_3d
+from d2_plugin.gaussians.rotation4d import covariances_from_factors, rotation_matrices_3d
 from d2_plugin.rasterizer import Splats, View
 
 FOCAL = 0.85
@@ -30,22 +30,21 @@ GARDEN_SCALES = (1e-4, 0.02)
 
 
 class Scene(NamedTuple):
-    """What a rasterizer gets: Gaussians as factors (peers want quaternions and scales), colors and a camera."""
+    """What a rasterizer gets: Gaussians, their colors, and a camera."""
 
     means: Tensor  # [M, 3]
-    quaternions: Tensor  # [M, 4] w first, unit
-    scales: Tensor  # [M, 3] standard deviations
+    covariances: Tensor  # [M, 6]
     opacities: Tensor  # [M]
     colors: Tensor  # [M, 3]
     view: View
 
     def splats(self) -> Splats:
-        """The same Gaussians with covariances."""
-        factor = _rotations(self.quaternions) * self.scales[:, None, :]
-        covariance = factor @ factor.mT
-        upper = torch.triu_indices(3, 3)
-        rows = torch.arange(len(self.means))
-        return Splats(self.means, covariance[:, upper[0], upper[1]].contiguous(), self.opacities, rows)
+        """The Gaussians without their colors."""
+        return Splats(*self[:3], torch.arange(len(self.means), device=self.means.device))
+
+    def leaves(self, dtype: torch.dtype, device: torch.device | str = "cpu") -> Self:
+        """The same in a precision on a device, with tensors that require gradients."""
+        return type(self)._make([*(part.to(device, dtype).detach().requires_grad_() for part in self[:4]), self.view])
 
 
 def load_scene(name: str, width: int, height: int, garden: Path | None = None) -> Scene:
@@ -73,13 +72,14 @@ def synthetic_scene(count: int, width: int, height: int) -> Scene:
     across = random.uniform(-0.55, 0.55, count) * reference_width / focal
     down = random.uniform(-0.55, 0.55, count) * reference_height / focal
     means = np.stack([across * depth, down * depth, depth], 1)
-    quaternions = _unit(random.normal(size=(count, 4)))
+    quaternions = random.normal(size=(count, 4))
     scales = np.exp(random.normal(0, 0.7, (count, 1)) + random.normal(0, 0.5, (count, 3))) * depth[:, None] / focal
-    scales *= _scale_for_radius(means, quaternions, scales, focal)
+    factors = _factors(quaternions, scales)
+    factors *= _scale_for_radius(means, factors, focal)
     opacities = np.clip(random.beta(0.8, 1.2, count), 0.005, 0.995)
     colors = random.uniform(0, 1, (count, 3))
     view = _view(np.eye(4), FOCAL * width, FOCAL * width, width, height)
-    return _scene(view, means, quaternions, scales, opacities, colors)
+    return _scene(view, means, factors, opacities, colors)
 
 
 def garden_scene(path: Path, width: int, height: int) -> Scene:
@@ -92,26 +92,20 @@ def garden_scene(path: Path, width: int, height: int) -> Scene:
     means, colors = means[inside], colors[inside]
     random = np.random.default_rng(0)
     scales = random.uniform(*GARDEN_SCALES, (len(means), 3))
-    quaternions = _unit(random.normal(size=(len(means), 4)))
+    factors = _factors(random.normal(size=(len(means), 4)), scales)
     opacities = np.clip(random.uniform(0, 1, len(means)), 0.005, 0.995)
     focal_x, focal_y = K[0, 0] * width / original_width, K[1, 1] * height / original_height
     view = _view(T_camera_world, focal_x, focal_y, width, height)
-    return _scene(view, means, quaternions, scales, opacities, colors)
+    return _scene(view, means, factors, opacities, colors)
 
 
-def _rotations(quaternions: Tensor) -> Tensor:
-    """Rotation matrices [M, 3, 3] of unit quaternions [M, 4], w first."""
-    return rotation_matrices_3d(quaternions.T).permute(2, 0, 1)
-
-
-def _scale_for_radius(means: np.ndarray, quaternions: np.ndarray, scales: np.ndarray, focal: float) -> float:
+def _scale_for_radius(means: np.ndarray, factors: np.ndarray, focal: float) -> float:
     """Factor on all scales that makes the mean 3-sigma radius on the screen, blur included, `RADIUS`."""
-    factor = _rotations(torch.from_numpy(quaternions)).numpy() * scales[:, None, :]
     x, y, z = means.T
     jacobian = np.zeros((len(z), 2, 3))
     jacobian[:, 0, 0] = jacobian[:, 1, 1] = focal / z
     jacobian[:, 0, 2], jacobian[:, 1, 2] = -focal * x / z**2, -focal * y / z**2
-    screen = jacobian @ factor
+    screen = jacobian @ factors
     covariance = screen @ screen.transpose(0, 2, 1)
     low, high = 1e-3, 10.0
     for _ in range(40):
@@ -121,8 +115,10 @@ def _scale_for_radius(means: np.ndarray, quaternions: np.ndarray, scales: np.nda
     return middle
 
 
-def _unit(quaternions: np.ndarray) -> np.ndarray:
-    return quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)
+def _factors(quaternions: np.ndarray, scales: np.ndarray) -> np.ndarray:
+    """Factors L [M, 3, 3] of Sigma = L L^T, from quaternions [M, 4] of any length, w first, and deviations [M, 3]."""
+    unit = quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)
+    return rotation_matrices_3d(torch.from_numpy(unit.T)).permute(2, 0, 1).numpy() * scales[:, None, :]
 
 
 def _view(T_camera_world: np.ndarray, focal_x: float, focal_y: float, width: int, height: int) -> View:
@@ -130,7 +126,7 @@ def _view(T_camera_world: np.ndarray, focal_x: float, focal_y: float, width: int
     return View("bench", 0, 0.0, torch.from_numpy(np.asarray(T_camera_world, np.float32)), K, width, height)
 
 
-def _scene(view: View, *parts: np.ndarray) -> Scene:
-    means, *more = (torch.from_numpy(np.ascontiguousarray(part, np.float32)) for part in parts)
-    quaternions, scales, opacities, colors = more
-    return Scene(means, quaternions, scales, opacities, colors, view)
+def _scene(view: View, means: np.ndarray, factors: np.ndarray, *more: np.ndarray) -> Scene:
+    covariances = covariances_from_factors(torch.from_numpy(factors).permute(1, 2, 0)).numpy()
+    parts = (torch.from_numpy(np.asarray(part, np.float32)) for part in (means, covariances, *more))
+    return Scene._make([*parts, view])

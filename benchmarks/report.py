@@ -3,38 +3,55 @@
 Files of rows (runs.jsonl) and output folders of `d2 train` make one page of plots and tables.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
-from benchmarks import align, raster, scaling, stereo, training_step
+from benchmarks import align, raster, scaling, stereo
 from benchmarks.gpu import proof
-from benchmarks.never_worse import bench as never_worse_bench
+from benchmarks.never_worse import bench as never_worse
 from benchmarks.priors_section import priors
 from benchmarks.rivals import sweep as sweep_of_rivals
 from benchmarks.stability import sweep
 from benchmarks.work_precision import colors_of, work_precision
 from d2_plugin.runs.report import report
 from d2_plugin.runs.report.page import Section, sources_of
-from d2_plugin.runs.report.report import BUILDERS, ReportSettings
-from d2_plugin.runs.report.svg import figure
+from d2_plugin.runs.report.report import BUILDERS, Builder, ReportSettings
+from d2_plugin.runs.report.svg import Plot, figure
 from d2_plugin.runs.rows import Row
+from d2_plugin.runs.tables import Table
 
 __all__ = ["ReportSettings", "run"]
 
 PLOTTED_ANCHORS = 20_000
 """Number of anchors that is plotted, or the nearest one that was measured."""
 
+GPU = (
+    "Static analysis is what the compiler says of a kernel, and no measurement: nothing here has run on a GPU "
+    "unless a step below says so."
+)
+STABILITY = (
+    "Each parameter is swept to where other codebases break. ok: the error is below the sweep's limit; gap: it is "
+    "above, and finite; failure: not finite, or refused where it should not be. Nothing is clamped in silence."
+)
+GROWTH = "Priors should take no more than linearly longer, and training no more memory: frames are read when needed."
 
-def never_worse(rows: Sequence[Row]) -> Section:
-    """D² with wrong monocular maps beside stereo alone and the backbone alone."""
-    tables = [("Scores", never_worse_bench.table(rows))]
-    return _section("never_worse", "Never worse than without", never_worse_bench.CAPTION, rows, {}, tables)
 
+def section(
+    name: str,
+    title: str,
+    text: str,
+    tables: Callable[[Sequence[Row]], list[tuple[str, Table]]],
+    plot: Callable[[Sequence[Row]], tuple[Plot, str]] | None = None,
+) -> Builder:
+    """What makes a section of tables from the rows of one kind, and a figure if there is a plot with its title."""
 
-def rivals_swept(rows: Sequence[Row]) -> Section:
-    """Each rival as published and at its best, by a sweep of weight and schedule."""
-    return _section(
-        "sweep", "Rivals at their best", sweep_of_rivals.CAPTION, rows, {}, [("Swept", sweep_of_rivals.table(rows))]
-    )
+    def build(rows: Sequence[Row]) -> Section:
+        figures = {}
+        if plot is not None:
+            drawn, said = plot(rows)
+            figures = {name: figure([drawn], said)}
+        return Section(name, title, text, figures, tuple(tables(rows)), sources_of(rows))
+
+    return build
 
 
 def alignment(rows: Sequence[Row]) -> Section:
@@ -52,73 +69,33 @@ def alignment(rows: Sequence[Row]) -> Section:
     ]
     drawn = figure(plots, "Gap and depth error of alignment", columns=len(shares), size=(276, 270))
     title = f"Alignment: the positive-scale Charbonnier fit (plots: {anchors} anchors)"
-    return _section("alignment", title, align.CAPTION, rows, {"alignment": drawn}, align.tables(rows))
+    return Section("alignment", title, align.CAPTION, {"alignment": drawn}, tuple(align.tables(rows)), sources_of(rows))
 
 
-def stereo_depth(rows: Sequence[Row]) -> Section:
+def stereo_plot(rows: Sequence[Row]) -> tuple[Plot, str]:
     """Geometric depth after the common filter: 1 - F against CPU seconds per view, mean over rigs."""
     plot = work_precision(rows, "Mean over rigs", "1 - F at 1 %", "CPU seconds per view")
-    drawn = figure([plot], "1 - F against CPU time of stereo")
-    return _section(
-        "stereo", "Stereo: geometric depth", stereo.CAPTION, rows, {"stereo": drawn}, stereo.tables(rows)[:1]
-    )
+    return plot, "1 - F against CPU time of stereo"
 
 
-def rasterizer(rows: Sequence[Row]) -> Section:
+def raster_plot(rows: Sequence[Row]) -> tuple[Plot, str]:
     """Deviation from float64 against milliseconds."""
     plot = work_precision(rows, "Mean over scenes and sizes", "colour error, p99.9", "forward + backward, ms", 1e3)
-    drawn = {"raster": figure([plot], "Rasterizer error against time")}
-    tables = [("Every scene and size", raster.table(rows))]
-    return _section("raster", "Rasterizer: time and precision", raster.CAPTION, rows, drawn, tables)
-
-
-def step(rows: Sequence[Row]) -> Section:
-    """One training step beside the rasterizer's own forward and backward, in CPU time."""
-    text = (
-        "The rasterizer alone, a bare step and a step with the depth loss run in turn in one process on a synthetic "
-        "scene whose Gaussians stay as they are. What counts is the ratio: the machine is shared."
-    )
-    return _section("step", "A training step", text, rows, {}, [("Steps", training_step.table(rows))])
-
-
-def gpu(rows: Sequence[Row]) -> Section:
-    """What is known of the CUDA kernels: steps that ran on a device, and what nvcc says of them without one."""
-    text = (
-        "Static analysis is what the compiler says of a kernel, and no measurement: nothing here has run on a GPU "
-        "unless a step below says so."
-    )
-    return _section("gpu", "The GPU kernels", text, rows, {}, proof.tables(rows))
-
-
-def stability(rows: Sequence[Row]) -> Section:
-    """Sweeps to where numbers end, float32 beside float64."""
-    text = (
-        "Each parameter is swept to where other codebases break. ok: the error is below the sweep's limit; gap: it is "
-        "above, and finite; failure: not finite, or refused where it should not be. Nothing is clamped in silence."
-    )
-    return _section("stability", "Stability: stiff and extreme cases", text, rows, {}, sweep.tables(rows))
-
-
-def growth(rows: Sequence[Row]) -> Section:
-    """How time and memory grow with the number of frames."""
-    text = "Priors should take no more than linearly longer, and training no more memory: frames are read when needed."
-    title = "Scaling: growth with the number of frames"
-    return _section("scaling", title, text, rows, {}, [("Measured", scaling.table(rows))])
-
-
-def _section(name: str, title: str, text: str, rows: Sequence[Row], figures: dict[str, str], tables: list) -> Section:
-    return Section(name, title, text, figures, tuple(tables), sources_of(rows))
+    return plot, "Rasterizer error against time"
 
 
 EVERY = BUILDERS | {
-    **{
-        "sweep": rivals_swept,
-        "never_worse": never_worse,
-        "alignment": alignment,
-        "stereo": stereo_depth,
-        "priors": priors,
-    },
-    **{"raster": rasterizer, "step": step, "gpu": gpu, "stability": stability, "scaling": growth},
+    "sweep": section("sweep", "Rivals at their best", sweep_of_rivals.CAPTION, sweep_of_rivals.tables),
+    "never_worse": section("never_worse", "Never worse than without", never_worse.CAPTION, never_worse.tables),
+    "alignment": alignment,
+    "stereo": section(
+        *("stereo", "Stereo: geometric depth", stereo.CAPTION, lambda rows: stereo.tables(rows)[:1], stereo_plot)
+    ),
+    "priors": priors,
+    "raster": section("raster", "Rasterizer: time and precision", raster.CAPTION, raster.tables, raster_plot),
+    "gpu": section("gpu", "The GPU kernels", GPU, proof.tables),
+    "stability": section("stability", "Stability: stiff and extreme cases", STABILITY, sweep.tables),
+    "scaling": section("scaling", "Scaling: growth with the number of frames", GROWTH, scaling.tables),
 }
 """What makes the section of each kind of row, in the order of the page."""
 

@@ -1,9 +1,11 @@
-"""Rows of a benchmark, whose file is looked at before anything is measured."""
+"""What all benchmarks do with their rows: their file is looked at before anything is measured, and named at the end."""
 
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from d2_plugin.runs.rows import append_rows
+from d2_plugin.runs.rows import Row, append_rows
+from d2_plugin.runs.tables import Table, markdown
 
 
 def begin_rows(path: Path) -> None:
@@ -17,3 +19,17 @@ def begin_rows(path: Path) -> None:
     if absent:
         with suppress(OSError):
             path.unlink()
+
+
+def told(tables: Iterable[tuple[str, Table]], path: Path, *before: str) -> str:
+    """What a benchmark prints: what stands before its tables, these with their titles, and where the rows lie."""
+    shown = [part for title, table in tables for part in (title, markdown(table))]
+    return "\n\n".join([*before, *shown, f"rows are in {path}; `python -m benchmarks report` draws them"])
+
+
+def grouped(rows: Sequence[Row], *names: str) -> dict[tuple[str, ...], list[Row]]:
+    """The rows that agree in these fields, by their values, in order of appearance."""
+    groups: dict[tuple[str, ...], list[Row]] = {}
+    for row in rows:
+        groups.setdefault(tuple(row[name] for name in names), []).append(row)
+    return groups

@@ -14,13 +14,13 @@ from typing import Annotated, Any
 import numpy as np
 
 from benchmarks.memory import in_fresh_process
-from benchmarks.rows import begin_rows
+from benchmarks.rows import begin_rows, told
 from d2_plugin.recordings.export.folder import save_recording
 from d2_plugin.recordings.synthetic.room import split, synthetic_recording
 from d2_plugin.runs.rows import Row, append_rows, command_line, make_row
 from d2_plugin.runs.run import Run
 from d2_plugin.runs.settings import RunSettings
-from d2_plugin.runs.tables import Table, markdown
+from d2_plugin.runs.tables import Table
 from d2_plugin.settings import Range, Settings
 
 
@@ -58,7 +58,7 @@ def run(settings: ScalingBench) -> str:
                 case = f"synthetic, {count} frames"
                 rows.append(make_row("scaling", case, part, f"{count} frames", error=None, command=command, **about))
     append_rows(settings.output, rows)
-    return f"{markdown(table(rows))}\nrows are in {settings.output}"
+    return told(tables(rows), settings.output)
 
 
 def _priors(settings: RunSettings, folder: Path) -> dict[str, Any]:
@@ -73,7 +73,7 @@ def _training(settings: RunSettings, folder: Path) -> dict[str, Any]:
     return {"seconds": run.seconds["train"]}
 
 
-def table(rows: Sequence[Row]) -> Table:
+def tables(rows: Sequence[Row]) -> list[tuple[str, Table]]:
     """One line per part and cost: its value for each length, and the power of the number of frames it grows as."""
     lengths, lines = sorted({row["frames"] for row in rows}), []
     for part in ("priors", "training"):
@@ -82,7 +82,8 @@ def table(rows: Sequence[Row]) -> Table:
             grown = exponent(places)
             values = (f"{dict(places)[length]:.1f}" if length in dict(places) else "-" for length in lengths)
             lines.append((part, title, *values, "-" if grown is None else f"frames^{round(grown, 2) + 0.0:.2f}"))
-    return Table(("part", "of", *(f"{length:g} frames" for length in lengths), "grows as"), tuple(lines))
+    header = ("part", "of", *(f"{length:g} frames" for length in lengths), "grows as")
+    return [("Measured", Table(header, tuple(lines)))]
 
 
 def exponent(points: Sequence[tuple[float, float]]) -> float | None:

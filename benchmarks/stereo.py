@@ -9,11 +9,11 @@ from typing import Annotated, Any, Literal
 
 import torch
 
-from benchmarks.rows import begin_rows
+from benchmarks.rows import begin_rows, grouped, told
 from benchmarks.stereo_measure import VARIANTS, measure
 from benchmarks.stereo_rigs import ARCS, MIDDLEBURY, load_rigs
 from d2_plugin.runs.rows import Row, append_rows, command_line, make_row
-from d2_plugin.runs.tables import Table, markdown
+from d2_plugin.runs.tables import Table
 from d2_plugin.settings import AtATime, Range, Settings
 
 logger = logging.getLogger(__name__)
@@ -63,8 +63,7 @@ def run(settings: StereoBench) -> str:
             rows.append(_row(measure(name, variant, group, repeats=settings.repeats), **about))
             append_rows(settings.output, rows[-1:])
             logger.info("%s on %s is measured", name, rows[-1]["rig"])
-    shown = [part for title, table in tables(rows) for part in (title, markdown(table))]
-    return "\n\n".join([CAPTION, *shown, f"rows are in {settings.output}"])
+    return told(tables(rows), settings.output, CAPTION)
 
 
 def _row(found: dict[str, Any], **more: Any) -> Row:
@@ -87,10 +86,8 @@ CAPTION = (
 def tables(rows: Sequence[Row]) -> list[tuple[str, Table]]:
     """The mean over rigs per method and setting, then every rig."""
     header = ("matcher", "setting", "completeness", "F at 1 %", "median error", "off > 5 %", "CPU s", "CPU µs/pixel")
-    groups: dict[tuple[str, str], list[Row]] = {}
-    for row in rows:
-        groups.setdefault((row["method"], row["setting"]), []).append(row)
-    over_rigs = Table(header, tuple((*key, *_numbers(_mean(group))) for key, group in groups.items()))
+    groups = grouped(rows, "method", "setting").items()
+    over_rigs = Table(header, tuple((*key, *_numbers(_mean(group))) for key, group in groups))
     return [
         ("Mean over rigs", over_rigs),
         ("Every rig", Table(("rig", "views", "size", *header), tuple(map(_cells, rows)))),

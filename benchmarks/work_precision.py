@@ -8,6 +8,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
+from benchmarks.rows import grouped
 from d2_plugin.runs.report.svg import Axis, Plot, Point, Series, number
 from d2_plugin.runs.rows import Row
 
@@ -28,18 +29,15 @@ class Mean(NamedTuple):
 
 def means(rows: Sequence[Row]) -> list[Mean]:
     """One `Mean` per (method, setting), in order of appearance."""
-    groups: dict[tuple[str, str], list[Row]] = {}
-    for row in rows:
-        groups.setdefault((row["method"], row["setting"]), []).append(row)
     return [
         Mean(
-            *key,
+            *(key[0], key[1]),
             _geometric(row["error"] for row in group if row["error"] is not None),
             _geometric(row["seconds"] for row in group if row["seconds"]),
             len(group),
             sum(bool(row["failed"]) for row in group),
         )
-        for key, group in groups.items()
+        for key, group in grouped(rows, "method", "setting").items()
     ]
 
 

@@ -6,6 +6,7 @@ half an hour loses nothing. A step that cannot run here says why in one sentence
 
 import logging
 import os
+import shlex
 import shutil
 import signal
 import subprocess
@@ -19,10 +20,11 @@ from typing import Annotated, NamedTuple
 import torch
 
 from benchmarks.gpu.static import ARCHITECTURES, static_analysis
+from benchmarks.rows import told
 from d2_plugin.durable import make_folder
 from d2_plugin.errors import refuse_unknown
 from d2_plugin.runs.rows import Row, append_rows, command_line, make_row
-from d2_plugin.runs.tables import Table, markdown
+from d2_plugin.runs.tables import Table
 from d2_plugin.settings import Range, Settings
 
 logger = logging.getLogger(__name__)
@@ -71,89 +73,62 @@ def _program(name: str) -> Need:
     return lambda settings: None if shutil.which(name) else f"{name} is not on the path: install the CUDA toolkit"
 
 
-class Step(NamedTuple):
-    """A part of the proof: its time limit, what it needs and its command."""
-
-    limit: int  # seconds
-    needs: tuple[Need, ...]
-    words: Callable[[GpuBench], list[str]] | None
-    """The command; None for the static analysis, which runs in this process."""
-
-
-def _pytest(*words: str) -> Callable[[GpuBench], list[str]]:
-    return lambda settings: [sys.executable, "-m", "pytest", "-q", *words]
-
-
-def _d2(*words: str) -> list[str]:
-    return [str(Path(sys.executable).with_name("d2")), *words]
-
-
-def _part(*words: str) -> list[str]:
-    return [sys.executable, "-m", "benchmarks", *words]
-
-
-def _sanitizer(tool: str) -> Step:
-    # Small scenes: a sanitizer slows a kernel down a hundred times.
-    chosen = ["-m", "cuda", "tests/rasterizer/test_rasterizer_kernels.py", "-k", "one or 7x5 or survey"]
-    watched = ["compute-sanitizer", "--tool", tool, "--error-exitcode", "9"]
-    words = [*watched, sys.executable, "-m", "pytest", "-q", *chosen]
-    return Step(120, (_device, _tests, _program("compute-sanitizer")), lambda settings: words)
-
-
-def _raster(settings: GpuBench) -> list[str]:
-    sizes = ("--sizes", "640x360,1920x1080", "--scenes", "synth:50000,synth:200000,synth:1000000")
-    kind = ("--device", "cuda", "--seconds", "2", "--error-limit", "60000")
-    return _part("raster", *kind, *sizes, "--output", str(settings.output / "raster.jsonl"))
-
-
-def _train(device: str) -> Callable[[GpuBench], list[str]]:
-    def words(settings: GpuBench) -> list[str]:
-        given = ["--device", device, "--iterations", str(settings.iterations)]
-        given += ["--train-cameras", settings.train_cameras]
-        return _d2("train", str(settings.recording), *given, "--output", str(settings.output / f"train-{device}"))
-
-    return words
-
-
-def _compare(settings: GpuBench) -> list[str]:
-    return _d2("compare", *(str(settings.output / f"train-{device}") for device in ("cuda", "cpu")))
-
-
 def _trained(settings: GpuBench) -> str | None:
     missing = [name for name in ("train-cuda", "train-cpu") if not (settings.output / name).is_dir()]
     return f"{' and '.join(missing)} did not run: their reasons stand above" if missing else None
 
 
-def _profile(settings: GpuBench) -> list[str]:
-    kernels = "regex:d2_(render|backward|survey)$"
-    options = ["--set", "basic", "-k", kernels, "-c", "6", "-f", "-o", str(settings.output / "profile")]
-    work = ("--device", "cuda", "--scenes", "synth:200000", "--sizes", "1920x1080", "--seconds", "0.1", "--no-memory")
-    raster = _part("raster", *work, "--error-limit", "1", "--output", str(settings.output / "profiled.jsonl"))
-    return ["ncu", *options, *raster]
+class Step(NamedTuple):
+    """A part of the proof: its time limit, what it needs and its command."""
+
+    limit: int  # seconds
+    needs: tuple[Need, ...]
+    command: str
+    """Names in braces are settings of `GpuBench`, and programs; empty for the static analysis, which runs in this
+    process."""
+
+    def words(self, settings: GpuBench) -> list[str]:
+        """The command of this machine."""
+        python = shlex.quote(sys.executable)
+        programs = {"bench": f"{python} -m benchmarks", "pytest": f"{python} -m pytest -q"}
+        programs["d2"] = shlex.quote(str(Path(sys.executable).with_name("d2")))
+        given = {name: shlex.quote(str(value)) for name, value in vars(settings).items()}
+        return shlex.split(self.command.format(**programs, **given))
 
 
-def _stereo(device: str) -> Callable[[GpuBench], list[str]]:
-    def words(settings: GpuBench) -> list[str]:
-        kind = ("--defaults-only", "--rigs", "synthetic4", "--width", "640")
-        return _part("stereo", *kind, "--device", device, "--output", str(settings.output / f"stereo-{device}.jsonl"))
+def _sanitizer(tool: str) -> Step:
+    # Small scenes: a sanitizer slows a kernel down a hundred times.
+    chosen = "{pytest} -m cuda tests/rasterizer/test_rasterizer_kernels.py -k 'one or 7x5 or survey'"
+    needs = (_device, _tests, _program("compute-sanitizer"))
+    return Step(120, needs, f"compute-sanitizer --tool {tool} --error-exitcode 9 {chosen}")
 
-    return words
 
+RASTER = "{bench} raster --device cuda --output {output}/"
+STEREO = "{bench} stereo --device cuda --defaults-only --rigs synthetic4 --width 640 --output {output}/"
+TRAIN = "{d2} train {recording} --train-cameras {train_cameras} --iterations {iterations} --output {output}/train-"
+PROFILE = "ncu --set basic -k 'regex:d2_(render|backward|survey)$' -c 6 -f -o {output}/profile"
 
-SHIM = ("-k", "shim", "tests/rasterizer/test_rasterizer_kernels.py", "tests/priors/test_patchmatch_gpu.py")
 STEPS = {
-    "static": Step(100, (_program("nvcc"),), None),
-    "tests": Step(180, (_device, _tests), _pytest("-m", "cuda", "tests")),
-    "memcheck": _sanitizer("memcheck"),
-    "racecheck": _sanitizer("racecheck"),
-    "initcheck": _sanitizer("initcheck"),
-    "raster": Step(240, (_device,), _raster),
-    "stereo-cuda": Step(60, (_device,), _stereo("cuda")),
-    "train-cuda": Step(150, (_device, _recording), _train("cuda")),
-    "train-cpu": Step(150, (_device, _recording), _train("cpu")),
-    "compare": Step(20, (_device, _recording, _trained), _compare),
-    "profile": Step(100, (_device, _program("ncu")), _profile),
-    "shim": Step(140, (_tests,), _pytest(*SHIM)),
+    "static": Step(100, (_program("nvcc"),), ""),
+    "tests": Step(180, (_device, _tests), "{pytest} -m cuda tests"),
+    **{tool: _sanitizer(tool) for tool in ("memcheck", "racecheck", "initcheck")},
+    "raster": Step(
+        *(240, (_device,)),
+        f"{RASTER}raster.jsonl --seconds 2 --sizes 640x360,1920x1080 --scenes synth:50000,synth:200000,synth:1000000",
+    ),
+    "stereo-cuda": Step(60, (_device,), f"{STEREO}stereo-cuda.jsonl"),
+    "train-cuda": Step(150, (_device, _recording), f"{TRAIN}cuda --device cuda"),
+    "train-cpu": Step(150, (_device, _recording), f"{TRAIN}cpu --device cpu"),
+    "compare": Step(20, (_device, _recording, _trained), "{d2} compare {output}/train-cuda {output}/train-cpu"),
+    "profile": Step(
+        *(100, (_device, _program("ncu"))),
+        f"{PROFILE} {RASTER}profiled.jsonl --scenes synth:200000 --sizes 1920x1080 --seconds 0.1 --no-memory "
+        "--error-limit 1",
+    ),
+    "shim": Step(
+        *(140, (_tests,)),
+        "{pytest} -k shim tests/rasterizer/test_rasterizer_kernels.py tests/priors/test_patchmatch_gpu.py",
+    ),
 }
 """In the order in which they are worth the time."""
 
@@ -168,15 +143,14 @@ def run(settings: GpuBench) -> str:
         rows += (done := _run_step(name, settings, command))
         append_rows(settings.output / "gpu.jsonl", done)
         logger.info("%s: %s", name, done[0]["failed"] or "done")
-    shown = "\n\n".join(markdown(table) for _, table in tables(rows))
-    return f"{shown}\n\ngpu.jsonl (rows) and the output of each step are in {settings.output}"
+    return told(tables(rows), settings.output / "gpu.jsonl") + "; the output of each step lies beside them"
 
 
 def _run_step(name: str, settings: GpuBench, command: str) -> list[Row]:
     step = STEPS[name]
     start = time.perf_counter()
     refused = next((reason for need in step.needs if (reason := need(settings))), None)
-    if refused is None and step.words is None:
+    if refused is None and not step.command:
         rows = _static(command)
         refused = None if rows else "nvcc compiled no kernel: please report this"
     else:
@@ -195,7 +169,6 @@ def _static(command: str) -> list[Row]:
 
 def _call(step: Step, name: str, settings: GpuBench) -> str | None:
     """Run a step's command with its output in a file; why it failed, or None."""
-    assert step.words is not None
     log = settings.output.resolve() / f"{name}.log"
     words = step.words(_resolved(settings))
     with log.open("w") as output:

@@ -7,8 +7,6 @@ each is built anew from its own maps, with the same geometric depth. Rows are wr
 command continues where it was stopped. `python -m benchmarks report` draws them.
 """
 
-import itertools
-import os
 import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -16,20 +14,20 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from benchmarks.never_worse.maps import SPOILED, spoiled_recording
+from benchmarks.short_runs import ShortRuns, measure_missing
 from d2_plugin.errors import D2Error
-from d2_plugin.progress import progress_bar
 from d2_plugin.runs.ablation.presets import PRESETS
 from d2_plugin.runs.prior.build import build_priors_for
 from d2_plugin.runs.report.quality import groups_of, scores_table
-from d2_plugin.runs.rows import Row, append_rows, command_line, read_rows
+from d2_plugin.runs.rows import Row, command_line
 from d2_plugin.runs.scene import Scene
 from d2_plugin.runs.settings import RunSettings, check, prior_settings
 from d2_plugin.runs.shared import Shared, share
 from d2_plugin.runs.start import TimedPoints
-from d2_plugin.runs.tables import Table, markdown
+from d2_plugin.runs.tables import Table
 from d2_plugin.runs.training.bench import Case, case_of
-from d2_plugin.runs.training.measured import Work, side_by_side
-from d2_plugin.settings import AtLeastOne, Count, Positional, Range, Seed, Settings
+from d2_plugin.runs.training.measured import Work
+from d2_plugin.settings import Range, Seed
 
 BACKBONE, STEREO = "backbone alone", "stereo alone"
 """Methods that use no monocular map."""
@@ -44,11 +42,9 @@ Maps = Literal["own", "noise", "smooth", "constant", "other", "network"]
 
 
 @dataclass(frozen=True)
-class NeverWorseBench(Settings):
+class NeverWorseBench(ShortRuns):
     """Settings of `python -m benchmarks never-worse`."""
 
-    recordings: Annotated[tuple[str, ...], Positional()] = ()
-    """Recordings with their cameras, as PATH@TRAIN+TRAIN or PATH@TRAIN+TRAIN@SCORE+SCORE."""
     maps: tuple[Maps, ...] = ("own", "noise", "smooth", "constant", "other", "network")
     """Monocular maps: the recording's own (a network's where it has none), random pixels, random blobs, one value,
     those of another frame (of another camera where there is one frame), and a network's."""
@@ -58,46 +54,19 @@ class NeverWorseBench(Settings):
     """Seeds."""
     backbone: str = "yang4d"
     """Name of a registered backbone."""
-    frames: tuple[Count, ...] | None = None
-    """Numbers of the frames, in every recording; all if not given."""
-    downscale: AtLeastOne = 1
-    """Make images this many times smaller along each side."""
-    mono_onnx: str | None = None
-    """ONNX model of monocular depth."""
-    mono_kind: Literal["relative", "metric"] | None = None
-    """What the model returns."""
-    jobs: Annotated[int, Range(1)] = os.cpu_count() or 1
-    """Runs at a time, one thread each."""
     output: Path = Path("never-worse")
     """Folder of recordings, priors, runs and never-worse.jsonl."""
 
 
 def run(settings: NeverWorseBench) -> str:
     """Measure what is missing; the table, and where the rows lie."""
-    if not settings.recordings:
-        raise D2Error("the benchmark never-worse needs a recording with its cameras: write PATH@00+02+05+07")
     path = settings.output / "never-worse.jsonl"
-    known = {(row["case"], row["method"], row["fingerprint"]) for row in _rows(path)}
-    works = [work for text in settings.recordings for work in _works(settings, text)]
-    missing = [work for work in works if (work.case, work.method, work.key[0]) not in known]
-    with progress_bar("bench never-worse", len(missing)) as bar:
-        done = itertools.count(1)
-
-        def write(row: Row) -> None:
-            append_rows(path, [row])
-            bar.update(next(done), f"{row['case']}: {row['method']}, {row['setting']}")
-
-        side_by_side(missing, settings.jobs, write)
-    return f"{markdown(table(_rows(path)))}\n\nrows are in {path}; `python -m benchmarks report` draws them"
+    return measure_missing("never-worse", settings, path, lambda text: _works(settings, text), tables)
 
 
-def _rows(path: Path) -> list[Row]:
-    return read_rows([path]) if path.is_file() else []
-
-
-def table(rows: Sequence[Row]) -> Table:
+def tables(rows: Sequence[Row]) -> list[tuple[str, Table]]:
     """The scores of each recording, by what the monocular maps were."""
-    return scores_table(groups_of([{**row, "method": f"yang4d {row['method']}"} for row in rows]))
+    return [("Scores", scores_table(groups_of([{**row, "method": f"yang4d {row['method']}"} for row in rows])))]
 
 
 def _works(settings: NeverWorseBench, text: str) -> Iterator[Work]:

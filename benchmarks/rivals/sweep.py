@@ -4,25 +4,21 @@ Sweep on cameras that no reported row trains: studio@01+03+04+06@00+02+05+07 whe
 studio@00+02+05+07@01+03+04+06. The best change of a rival is that with the highest mean PSNR over the recordings.
 """
 
-import itertools
-import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import mean
-from typing import Annotated, Literal
 
 from benchmarks.rivals.table import PUBLISHED, RIVALS, preset
-from d2_plugin.errors import D2Error
-from d2_plugin.progress import progress_bar
-from d2_plugin.runs.ablation.presets import PRESETS, Preset
-from d2_plugin.runs.rows import Row, append_rows, command_line, read_rows
+from benchmarks.short_runs import ShortRuns, measure_missing
+from d2_plugin.runs.ablation.presets import PRESETS
+from d2_plugin.runs.rows import Row, command_line
 from d2_plugin.runs.settings import RunSettings
 from d2_plugin.runs.shared import share
-from d2_plugin.runs.tables import Table, markdown
-from d2_plugin.runs.training.bench import Case, case_of
-from d2_plugin.runs.training.measured import Work, side_by_side
-from d2_plugin.settings import AtATime, Count, Downscale, Positional, Seed, Settings, Steps
+from d2_plugin.runs.tables import Table
+from d2_plugin.runs.training.bench import case_of
+from d2_plugin.runs.training.measured import Work
+from d2_plugin.settings import Seed, Steps
 
 CAPTION = (
     "Every weight and schedule that was tried for a rival, in short runs of one seed on training cameras that no other "
@@ -32,52 +28,23 @@ CAPTION = (
 
 
 @dataclass(frozen=True)
-class RivalsSweep(Settings):
+class RivalsSweep(ShortRuns):
     """Settings of `python -m benchmarks rivals-sweep`."""
 
-    recordings: Annotated[tuple[str, ...], Positional()] = ()
-    """Recordings with their cameras, as PATH@TRAIN+TRAIN or PATH@TRAIN+TRAIN@SCORE+SCORE."""
     rivals: tuple[str, ...] = tuple(RIVALS)
     """Which are swept."""
     steps: Steps = 400
     """Of each run."""
     seed: Seed = 0
     """Of each run."""
-    frames: tuple[Count, ...] | None = None
-    """Numbers of the frames, in every recording; all if not given."""
-    downscale: Downscale = 1
-    """Make images this many times smaller along each side."""
-    mono_onnx: str | None = None
-    """ONNX model of monocular depth; the recordings' own maps if not given."""
-    mono_kind: Literal["relative", "metric"] | None = None
-    """What the model returns."""
-    jobs: AtATime = os.cpu_count() or 1
-    """Runs at a time, one thread each."""
     output: Path = Path("rivals-sweep")
     """Folder of priors, runs and rivals-sweep.jsonl."""
 
 
 def run(settings: RivalsSweep) -> str:
     """Measure what is missing; the table, and where the rows lie."""
-    if not settings.recordings:
-        raise D2Error("the benchmark rivals-sweep needs a recording with its cameras: write PATH@00+02+05+07")
     path = settings.output / "rivals-sweep.jsonl"
-    known = {(row["case"], row["method"], row["setting"], row["iterations"]) for row in _rows(path)}
-    works = [work for text in settings.recordings for work in _works(settings, text)]
-    missing = [work for work in works if (work.case, work.method, work.about["change"], settings.steps) not in known]
-    with progress_bar("bench rivals-sweep", len(missing)) as bar:
-        done = itertools.count(1)
-
-        def write(row: Row) -> None:
-            append_rows(path, [{**row, "setting": row["change"]}])
-            bar.update(next(done), f"{row['case']}: {row['method']}, {row['change']}")
-
-        side_by_side(missing, settings.jobs, write)
-    return f"{markdown(table(_rows(path)))}\n\nrows are in {path}; `python -m benchmarks report` draws them"
-
-
-def _rows(path: Path) -> list[Row]:
-    return read_rows([path]) if path.is_file() else []
+    return measure_missing("rivals-sweep", settings, path, lambda text: _works(settings, text), tables)
 
 
 def _works(settings: RivalsSweep, text: str) -> Iterator[Work]:
@@ -89,21 +56,18 @@ def _works(settings: RivalsSweep, text: str) -> Iterator[Work]:
         for name in settings.rivals
         for change in (PUBLISHED, *(change for change in RIVALS[name].swept if change != PUBLISHED))
     ]
-    for name, change, chosen in [("backbone", "", PRESETS["backbone"]), *tried]:
-        yield _work(settings, case, name, change, chosen)
-
-
-def _work(settings: RivalsSweep, case: Case, name: str, change: str, chosen: Preset) -> Work:
     shared = share(case.settings, settings.output.absolute() / case.slug)
-    guidance = None if chosen.guidance is None else chosen.guidance(settings.steps)
-    used = replace(case.settings, hooks=(), overrides=chosen.merged({}))
-    used = used if guidance is None else replace(used, priors=str(shared.priors))
-    folder = shared.folder / "sweep" / name / (change.replace(" ", "_").replace(",", "") or "alone")
-    about = (case.name, name, command_line("python -m benchmarks rivals-sweep", settings), f"{settings.steps} steps")
-    return Work(used, folder, shared.points, *about, {"change": change}, kind="sweep", guidance=guidance)
+    command, target = command_line("python -m benchmarks rivals-sweep", settings), f"{settings.steps} steps"
+    for name, change, chosen in [("backbone", "", PRESETS["backbone"]), *tried]:
+        guidance = None if chosen.guidance is None else chosen.guidance(settings.steps)
+        used = replace(case.settings, hooks=(), overrides=chosen.merged({}))
+        used = used if guidance is None else replace(used, priors=str(shared.priors))
+        folder = shared.folder / "sweep" / name / (change.replace(" ", "_").replace(",", "") or "alone")
+        about = (case.name, name, command, target, {"change": change})
+        yield Work(used, folder, shared.points, *about, kind="sweep", guidance=guidance)
 
 
-def table(rows: Sequence[Row]) -> Table:
+def tables(rows: Sequence[Row]) -> list[tuple[str, Table]]:
     """One line per rival: as published, at its best, and what the sweep cost."""
     cases = list(dict.fromkeys(row["case"] for row in rows))
     psnr = {(row["method"], row["setting"], row["case"]): row["scores"]["psnr"] for row in rows if row["scores"]}
@@ -115,7 +79,7 @@ def table(rows: Sequence[Row]) -> Table:
         scores = ["-" if value is None else f"{value:.2f}" for value in found]
         mine = [row for row in rows if row["method"] == name]
         cells.append((name, best, *scores, str(len(mine)), f"{sum(row['seconds'] for row in mine):.0f}"))
-    return Table((*titles, "runs", "CPU s"), tuple(cells))
+    return [("Swept", Table((*titles, "runs", "CPU s"), tuple(cells)))]
 
 
 def best_change(rows: Sequence[Row], name: str) -> str:

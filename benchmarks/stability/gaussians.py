@@ -6,13 +6,15 @@ The truth is a closed form, or an image that must be the same: that of the scene
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from benchmarks.stability.definition import Sweep, decades
+from benchmarks.raster_scenes import Scene
+from benchmarks.stability.definition import decades, sweep
 from d2_plugin import registry
+from d2_plugin.gaussians.rotation4d import covariances_from_factors
 from d2_plugin.rasterizer import RasterSettings, Render, Splats, View, rasterize
 
 WIDTH, HEIGHT, FOCAL = 64, 48, 54.0
@@ -20,40 +22,28 @@ THRESHOLDS = RasterSettings(alpha_min=1e-12, transmittance_min=1e-12)
 """Sweeps that compare two images leave the thresholds out: a pixel at one of them may fall to either side."""
 
 
-class Scene(NamedTuple):
-    """Gaussians as factors L of Sigma = L L^T, float64, and a camera that looks along z."""
+def render(scene: Scene, dtype: torch.dtype, near: float = 0.2) -> Render:
+    """The image in a precision; covariances were made in float64 and are rounded once."""
+    settings = RasterSettings(near, alpha_min=THRESHOLDS.alpha_min, transmittance_min=THRESHOLDS.transmittance_min)
+    rounded = Scene._make([*(part.to(dtype) for part in scene[:4]), scene.view])
+    return rasterize(rounded.splats(), rounded.colors, scene.view, settings)
 
-    means: Tensor  # [M, 3]
-    factors: Tensor  # [M, 3, 3]
-    opacities: Tensor  # [M]
-    colors: Tensor  # [M, 3]
-    pose: Tensor  # [4, 4] world to camera
 
-    def render(self, dtype: torch.dtype, near: float = 0.2) -> Render:
-        """The image in a precision; covariances are made in float64 and rounded once."""
-        full = self.factors @ self.factors.mT
-        upper = torch.triu_indices(3, 3)
-        packed = full[:, upper[0], upper[1]]
-        means, covariances, opacities = (part.to(dtype) for part in (self.means, packed, self.opacities))
-        splats = Splats(means, covariances, opacities, torch.arange(len(self.means)))
-        settings = RasterSettings(near, alpha_min=THRESHOLDS.alpha_min, transmittance_min=THRESHOLDS.transmittance_min)
-        return rasterize(splats, self.colors.to(dtype), camera(self.pose), settings)
+def turned(scene: Scene, rotation: Tensor) -> Scene:
+    """The same scene in a world turned by `rotation` [3, 3]."""
+    turn = torch.eye(4, dtype=torch.float64)
+    turn[:3, :3] = rotation.T
+    full = scene.covariances[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].view(-1, 3, 3)
+    packed = (rotation @ full @ rotation.T)[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
+    view = camera(scene.view.T_camera_world @ turn)
+    return scene._replace(means=scene.means @ rotation.T, covariances=packed, view=view)
 
-    def turned(self, rotation: Tensor) -> Scene:
-        """The same scene in a world turned by `rotation` [3, 3]."""
-        turn = torch.eye(4, dtype=torch.float64)
-        turn[:3, :3] = rotation.T
-        return self._replace(means=self.means @ rotation.T, factors=rotation @ self.factors, pose=self.pose @ turn)
 
-    def scaled(self, unit: float) -> Scene:
-        """The same scene in another unit of length."""
-        return self._replace(means=self.means * unit, factors=self.factors * unit)
-
-    def moved(self, offset: Tensor) -> Scene:
-        """The same scene elsewhere in the world; `offset` [3]."""
-        pose = self.pose.clone()
-        pose[:3, 3] -= pose[:3, :3] @ offset
-        return self._replace(means=self.means + offset, pose=pose)
+def moved(scene: Scene, offset: Tensor) -> Scene:
+    """The same scene elsewhere in the world; `offset` [3]."""
+    pose = scene.view.T_camera_world.clone()
+    pose[:3, 3] -= pose[:3, :3] @ offset
+    return scene._replace(means=scene.means + offset, view=camera(pose))
 
 
 def camera(pose: Tensor) -> View:
@@ -77,8 +67,9 @@ def random_scene(count: int = 60, ratio: float = 1.0, seed: int = 0) -> Scene:
     across = (draw(count, 2) - 0.5) * torch.tensor([WIDTH, HEIGHT], dtype=torch.float64) / FOCAL
     axes = torch.stack([random_rotation(seed * count + i) for i in range(count)])
     sizes = (0.1 + 0.2 * draw(count, 1)) * torch.tensor([1.0, ratio**-0.5, 1 / ratio], dtype=torch.float64)
-    pose = torch.eye(4, dtype=torch.float64)
-    return Scene(torch.cat([across * depth, depth], 1), axes * sizes[:, None], 0.9 * draw(count), draw(count, 3), pose)
+    covariances = covariances_from_factors((axes * sizes[:, None]).permute(1, 2, 0))
+    means = torch.cat([across * depth, depth], 1)
+    return Scene(means, covariances, 0.9 * draw(count), draw(count, 3), camera(torch.eye(4, dtype=torch.float64)))
 
 
 def difference(found: Render, expected: Render, unit: float = 1.0) -> float:
@@ -94,26 +85,43 @@ def largest(*errors: float) -> float:
     return math.nan if any(map(math.isnan, errors)) else max(errors)
 
 
+@sweep(
+    *("longest over shortest axis", decades(0, 9), "largest deviation of colour, alpha, depth"),
+    "the projected covariance is widened by .3 px², as in the Inria rasterizer",
+)
 def anisotropy(ratio: float, dtype: torch.dtype) -> float:
     """A scene of needles in a turned world against the same scene in float64."""
     scene = random_scene(ratio=ratio)
-    return difference(scene.turned(random_rotation(1)).render(dtype), scene.render(torch.float64))
+    return difference(render(turned(scene, random_rotation(1)), dtype), render(scene, torch.float64))
 
 
+@sweep(
+    *("unit of length", decades(-3, 6), "largest deviation of colour, alpha, depth in that unit"),
+    "Gaussians nearer than the near plane are culled; it is a setting, scaled here with the scene",
+)
 def depth(unit: float, dtype: torch.dtype) -> float:
     """A scene whose depths are `unit` times as large, near plane included, against the same scene in float64."""
     scene = random_scene()
-    turned = scene.turned(random_rotation(1)).scaled(unit)
-    return difference(turned.render(dtype, near=0.2 * unit), scene.render(torch.float64), unit)
+    other = turned(scene, random_rotation(1))
+    other = other._replace(means=other.means * unit, covariances=other.covariances * unit**2)
+    return difference(render(other, dtype, near=0.2 * unit), render(scene, torch.float64), unit)
 
 
+@sweep(
+    *("distance from the origin", decades(0, 6), "largest deviation of colour, alpha, depth"),
+    "nothing: float32 has 7 digits; a recording far from its origin must be recentred before it is trained",
+)
 def world_offset(offset: float, dtype: torch.dtype) -> float:
     """A scene and its camera, both moved `offset` away from the origin, against the same at the origin."""
     direction = torch.tensor([2.0, -1.0, 2.0], dtype=torch.float64) / 3
     scene = random_scene()
-    return difference(scene.moved(offset * direction).render(dtype), scene.render(torch.float64))
+    return difference(render(moved(scene, offset * direction), dtype), render(scene, torch.float64))
 
 
+@sweep(
+    *("logit", tuple(float(v) for v in range(-50, 51, 5)), "error of alpha and its gradient"),
+    "alpha is clamped at .99 with zero gradient beyond, and skipped below alpha_min (1e-12 here)",
+)
 def opacity_logit(logit: float, dtype: torch.dtype) -> float:
     """Alpha and its gradient at the middle of one Gaussian against min(.99, sigmoid) and its derivative."""
     value = torch.tensor([logit], dtype=dtype, requires_grad=True)
@@ -121,8 +129,8 @@ def opacity_logit(logit: float, dtype: torch.dtype) -> float:
     packed = torch.tensor([[0.5, 0, 0, 0.5, 0, 0.5]], dtype=dtype)
     view = camera(torch.eye(4, dtype=torch.float64))
     splats = Splats(mean, packed, value.sigmoid(), torch.arange(1))
-    render = rasterize(splats, torch.ones(1, 1, dtype=dtype), view, THRESHOLDS)
-    middle = render.alpha[HEIGHT // 2, WIDTH // 2]
+    image = rasterize(splats, torch.ones(1, 1, dtype=dtype), view, THRESHOLDS)
+    middle = image.alpha[HEIGHT // 2, WIDTH // 2]
     (gradient,) = torch.autograd.grad(middle, value)
     exact = 1 / (1 + math.exp(-logit))
     drawn, clamped = exact > THRESHOLDS.alpha_min, exact > THRESHOLDS.alpha_max
@@ -131,6 +139,10 @@ def opacity_logit(logit: float, dtype: torch.dtype) -> float:
     return largest(abs(middle.item() - alpha), abs(gradient.item() - slope))
 
 
+@sweep(
+    *("farthest depth beside one at .01", decades(0, 9), "deviation of colour and relative depth"),
+    "nothing: depths are sorted as floating-point numbers, there is no far plane",
+)
 def far_plane(far: float, dtype: torch.dtype) -> float:
     """A Gaussian just ahead of the camera and two that nearly touch at distance `far`: order, colour and depth."""
     depths = torch.tensor([far, 0.01, far * (1 + 1e-5)], dtype=torch.float64)
@@ -139,12 +151,12 @@ def far_plane(far: float, dtype: torch.dtype) -> float:
     packed = (depths[:, None] * 0.5) ** 2 * torch.tensor([1.0, 0, 0, 1, 0, 1], dtype=torch.float64)
     view = camera(torch.eye(4, dtype=torch.float64))
     splats = Splats(means.to(dtype), packed.to(dtype), torch.full((3,), 0.5, dtype=dtype), torch.arange(3))
-    render = rasterize(splats, torch.eye(3, dtype=dtype), view, RasterSettings(near=0.005))
+    image = rasterize(splats, torch.eye(3, dtype=dtype), view, RasterSettings(near=0.005))
     row, column = HEIGHT // 2, WIDTH // 2
     expected = torch.tensor([0.25, 0.5, 0.125], dtype=dtype)
     distance = (expected.double() * depths).sum().item()
-    colors = (render.color[row, column] - expected).abs().max().item()
-    return largest(colors, abs(render.depth_sum[row, column].item() / distance - 1))
+    colors = (image.color[row, column] - expected).abs().max().item()
+    return largest(colors, abs(image.depth_sum[row, column].item() / distance - 1))
 
 
 def one_gaussian(dtype: torch.dtype, **rows: list[float]) -> Any:
@@ -159,6 +171,10 @@ def one_gaussian(dtype: torch.dtype, **rows: list[float]) -> Any:
     return model
 
 
+@sweep(
+    *("variance of a life", decades(-20, 20, 2), "relative error of opacity and slope"),
+    "log-scales saturate at ±30 (a standard deviation of 1e-13..1e13)",
+)
 def temporal_variance(variance: float, dtype: torch.dtype) -> float:
     """Opacity one standard deviation from the middle of a life, and its slope in time, against the closed form."""
     sigma = math.sqrt(variance)
@@ -171,6 +187,10 @@ def temporal_variance(variance: float, dtype: torch.dtype) -> float:
     return largest(abs(opacity.item() / expected - 1), abs(slope.item() * sigma / expected - 1))
 
 
+@sweep(
+    *("velocity, lengths per frame", decades(0, 12), "relative error of the displacement"),
+    *("nothing: the factor is reflected, no difference is taken", {"float32": 1e-3, "float64": 1e-6}),
+)
 def fast_motion(speed: float, dtype: torch.dtype) -> float:
     """Where a Gaussian is a hundredth of a unit of time after the middle of its life, against the closed form.
 
@@ -189,40 +209,5 @@ def fast_motion(speed: float, dtype: torch.dtype) -> float:
     return abs(found[0, 0].abs().item() / along - 1)
 
 
-def gaussian_sweeps() -> list[Sweep]:
-    """The sweeps of this file."""
-    both = {"float32": 1e-4, "float64": 1e-9}
-    offsets = "nothing: float32 has 7 digits; a recording far from its origin must be recentred before it is trained"
-    return [
-        Sweep(
-            *("temporal variance", "variance of a life", decades(-20, 20, 2), "relative error of opacity and slope"),
-            *(both, "log-scales saturate at ±30 (a standard deviation of 1e-13..1e13)", temporal_variance),
-        ),
-        Sweep(
-            *("fast motion", "velocity, lengths per frame", decades(0, 12), "relative error of the displacement"),
-            *({"float32": 1e-3, "float64": 1e-6}, "nothing: the factor is reflected, no difference is taken"),
-            fast_motion,
-        ),
-        Sweep(
-            *("anisotropy", "longest over shortest axis", decades(0, 9), "largest deviation of colour, alpha, depth"),
-            *(both, "the projected covariance is widened by .3 px², as in the Inria rasterizer", anisotropy),
-        ),
-        Sweep(
-            *("depth", "unit of length", decades(-3, 6), "largest deviation of colour, alpha, depth in that unit"),
-            *(both, "Gaussians nearer than the near plane are culled; it is a setting, scaled here with the scene"),
-            depth,
-        ),
-        Sweep(
-            *("far plane", "farthest depth beside one at .01", decades(0, 9), "deviation of colour and relative depth"),
-            *(both, "nothing: depths are sorted as floating-point numbers, there is no far plane", far_plane),
-        ),
-        Sweep(
-            *("opacity logit", "logit", tuple(float(v) for v in range(-50, 51, 5)), "error of alpha and its gradient"),
-            *(both, "alpha is clamped at .99 with zero gradient beyond, and skipped below alpha_min (1e-12 here)"),
-            opacity_logit,
-        ),
-        Sweep(
-            *("world offset", "distance from the origin", decades(0, 6), "largest deviation of colour, alpha, depth"),
-            *(both, offsets, world_offset),
-        ),
-    ]
+GAUSSIANS = (temporal_variance, fast_motion, anisotropy, depth, far_plane, opacity_logit, world_offset)
+"""The sweeps of this file."""

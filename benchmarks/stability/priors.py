@@ -6,7 +6,7 @@ The fit always computes in float64; what is swept in float32 is the precision in
 import numpy as np
 import torch
 
-from benchmarks.stability.definition import Sweep, decades
+from benchmarks.stability.definition import decades, sweep
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.monocular.affine import fit_affine
 from d2_plugin.priors.monocular.align import AlignStatus, align
@@ -39,37 +39,34 @@ def aligned_scale(x: np.ndarray, y: np.ndarray) -> float:
     return found.scale
 
 
+@sweep(
+    *("share of wrong anchors", tuple(round(0.05 * i, 2) for i in range(13)), "relative error of the scale"),
+    "a fit with fewer than 30 % inliers, or that the ranks contradict, is refused with a status",
+    {"float32": 0.05, "float64": 0.05},
+)
 def outliers(share: float, dtype: torch.dtype) -> float:
     """Relative error of the scale with a share of uniform wrong depths."""
     return abs(aligned_scale(*maps(dtype, share)) / SCALE - 1)
 
 
-def smoothing(epsilon: float, dtype: torch.dtype) -> float:
-    """Certified relative duality gap with 45 % outliers; epsilon is a share of the median depth."""
+@sweep(
+    *("smoothing over median depth", decades(-8, -1), "certified relative duality gap"),
+    *("epsilon is at least 1e-100 in normalised units", {"float32": 1e-9, "float64": 1e-9}),
+)
+def epsilon(share: float, dtype: torch.dtype) -> float:
+    """Certified relative duality gap with 45 % outliers; epsilon is this share of the median depth."""
     x, y = maps(dtype, 0.45)
-    return fit_affine(x, y, epsilon=epsilon * float(np.median(y))).gap
+    return fit_affine(x, y, epsilon=share * float(np.median(y))).gap
 
 
-def depth_unit(unit: float, dtype: torch.dtype) -> float:
+@sweep(
+    *("unit of depth", decades(-3, 6), "relative error of the scale"),
+    *("nothing: data are centred and scaled before the fit", {"float32": 1e-3, "float64": 1e-3}),
+)
+def unit_of_depth(unit: float, dtype: torch.dtype) -> float:
     """Relative error of the scale when depth is measured in another unit."""
     return abs(aligned_scale(*maps(dtype, unit=unit)) / (SCALE * unit) - 1)
 
 
-def prior_sweeps() -> list[Sweep]:
-    """The sweeps of this file."""
-    shares = tuple(round(0.05 * i, 2) for i in range(13))
-    refusal = "a fit with fewer than 30 % inliers, or that the ranks contradict, is refused with a status"
-    return [
-        Sweep(
-            *("outliers", "share of wrong anchors", shares, "relative error of the scale"),
-            *({"float32": 0.05, "float64": 0.05}, refusal, outliers),
-        ),
-        Sweep(
-            *("epsilon", "smoothing over median depth", decades(-8, -1), "certified relative duality gap"),
-            *({"float32": 1e-9, "float64": 1e-9}, "epsilon is at least 1e-100 in normalised units", smoothing),
-        ),
-        Sweep(
-            *("unit of depth", "unit of depth", decades(-3, 6), "relative error of the scale"),
-            *({"float32": 1e-3, "float64": 1e-3}, "nothing: data are centred and scaled before the fit", depth_unit),
-        ),
-    ]
+PRIORS = (outliers, epsilon, unit_of_depth)
+"""The sweeps of this file."""

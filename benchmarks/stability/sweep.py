@@ -12,20 +12,20 @@ from pathlib import Path
 
 import torch
 
-from benchmarks.rows import begin_rows
+from benchmarks.rows import begin_rows, grouped, told
 from benchmarks.stability.definition import Sweep
-from benchmarks.stability.gaussians import gaussian_sweeps
-from benchmarks.stability.priors import prior_sweeps
+from benchmarks.stability.gaussians import GAUSSIANS
+from benchmarks.stability.priors import PRIORS
 from benchmarks.work_precision import shown
 from d2_plugin.errors import D2Error, refuse_unknown
 from d2_plugin.progress import progress_bar
 from d2_plugin.runs.rows import Row, append_rows, command_line, make_row
-from d2_plugin.runs.tables import Table, markdown
+from d2_plugin.runs.tables import Table
 from d2_plugin.settings import Settings
 
 PRECISIONS = {"float32": torch.float32, "float64": torch.float64}
 
-SWEEPS: dict[str, Sweep] = {sweep.name: sweep for sweep in (*gaussian_sweeps(), *prior_sweeps())}
+SWEEPS: dict[str, Sweep] = {sweep.name: sweep for sweep in (*GAUSSIANS, *PRIORS)}
 """Every sweep of the study by name, Gaussians first, then priors."""
 
 
@@ -44,8 +44,7 @@ def run(settings: StabilitySettings) -> str:
     begin_rows(settings.output)
     rows = run_sweeps(settings.sweeps, command_line("python -m benchmarks stability", settings))
     append_rows(settings.output, rows)
-    text = "\n\n".join(markdown(table) for _, table in tables(rows))
-    return f"{text}\n\nrows are in {settings.output}; `python -m benchmarks report` draws them"
+    return told(tables(rows), settings.output)
 
 
 def measure(sweep: Sweep, value: float, precision: str, command: str = "") -> Row:
@@ -99,8 +98,7 @@ def tables(rows: Sequence[Row]) -> list[tuple[str, Table]]:
     """Each sweep in each precision, what is guarded and how, and the points that are not ok."""
     header = ("sweep", "precision", "parameter", "points", "ok", "largest error", "limit")
     sweeps = []
-    for case, method in dict.fromkeys((row["case"], row["method"]) for row in rows):
-        mine = [row for row in rows if (row["case"], row["method"]) == (case, method)]
+    for (case, method), mine in grouped(rows, "case", "method").items():
         values = [row["value"] for row in mine]
         worst = max((row["error"] for row in mine if row["error"] is not None), default=None)
         span = f"{mine[0]['parameter']}: {min(values):g} .. {max(values):g}"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +18,7 @@ from d2_plugin.recordings import open_recording
 from d2_plugin.recordings.export.folder import save_recording
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.runs.report.report import make_report
-from d2_plugin.runs.rows import Row, read_rows
+from d2_plugin.runs.rows import read_rows
 
 pytest.importorskip("cv2")
 
@@ -49,23 +48,6 @@ def test_the_truth_itself_scores_full_marks_where_views_overlap(rig: Rig) -> Non
     assert 0.6 < np.mean(rig.covisible) < 0.95
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two cameras, three frames, true depth at the first and the last."""
-    room = synthetic_recording(2, held_out=0, frames=3, width=96, height=54)
-    path = save_recording(room, tmp_path_factory.mktemp("recordings") / "den")
-    for depth in path.glob("depth/*/00001.*"):
-        depth.unlink()
-    return path
-
-
-@pytest.fixture(scope="module")
-def measured(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, list[Row]]:
-    output = tmp_path_factory.mktemp("bench") / "runs.jsonl"
-    told = run(PriorsBench(rigs=("synthetic4",), width=96, frames=(0,), output=output))
-    return told, read_rows([output])
-
-
 @pytest.mark.parametrize("times", [0.5, 1.0, 2.0])
 def test_the_curve_of_known_errors_lies_as_many_times_above_the_diagonal_as_they_are_too_large(times: float) -> None:
     rng = np.random.default_rng(0)
@@ -86,49 +68,47 @@ def test_bins_of_a_few_pixels_and_a_sigma_of_zero_have_no_mark() -> None:
     assert reliability_curve(np.zeros(0), np.zeros(0)) == ()
 
 
-def test_a_rendered_rig_is_measured_without_any_data(measured: tuple[str, list[Row]]) -> None:
-    told, rows = measured
+def test_a_rendered_rig_is_measured_without_any_data_and_drawn(tmp_path: Path) -> None:
+    output = tmp_path / "rows.jsonl"
+    told = run(PriorsBench(rigs=("synthetic4",), width=96, frames=(0,), output=output))
+    rows = read_rows([output])
     assert "synthetic4, 4 views" in told
     assert "held against the true depth of 4 views" in told
     assert {row["kind"] for row in rows} == {"priors"}
+    *labels, far, motion = rows
     assert [row["method"] for row in rows] == ["verified", "agreed", "mono only", "far", "motion"]
-    for row in rows[:3]:
+    for row in labels:
         assert row["error"] == pytest.approx(abs(row["within"] - NORMAL_SHARE))
         assert 0 < row["share"] < 1
         assert row["seconds"] > 0
         assert row["mono_emulated"]
         assert all(len(point) == 3 for point in row["curve"])
-    motion = rows[4]
+    assert far["error"] == far["false_far"]
     assert 0.2 < motion["motion_right"] < motion["motion_known"] < 1
     assert motion["motion_psnr"] > 15
     assert 0 < motion["motion_within"] < motion["motion_within_two"] < 1
-    line = "python -m benchmarks priors --rigs synthetic4 --frames 0 --width 96 --output runs.jsonl"
+    line = "python -m benchmarks priors --rigs synthetic4 --frames 0 --width 96 --output rows.jsonl"
     assert rows[0]["command"] == line, "no folder of this machine"
+    make_report(rows, tmp_path, builders={"priors": priors})
+    svg, text = (tmp_path / "priors.svg").read_text(), (tmp_path / "report.md").read_text()
+    assert svg.count(" pixels</title>") == sum(len(row["curve"]) for row in labels) > 0
+    assert DIAGONAL in svg
+    assert "true error, 68 % quantile" in svg
+    assert "| synthetic4, 4 views | mono only |" in text
+    assert "emulated, not predicted" in text
+    assert "What moves: scene flow, and what lies between two instants" in text
 
 
-def test_frames_with_truth_are_those_of_any_of_the_cameras(folder: Path) -> None:
+def test_frames_with_truth_are_those_of_any_of_the_cameras(tmp_path: Path) -> None:
+    folder = save_recording(synthetic_recording(2, held_out=0, frames=3, width=96, height=54), tmp_path / "den")
+    for depth in folder.glob("depth/*/00001.*"):
+        depth.unlink()
     recording = cases(PriorsBench((str(folder),)))[0].recording
     assert frames_with_truth(recording, ["train0"]) == [0, 2]
     assert frames_with_truth(recording, []) == []
     long = synthetic_recording(1, held_out=0, frames=9, width=16, height=9)
     assert frames_with_truth(long, ["train0"], most=3) == [0, 4, 8], "spread over the recording"
     assert frames_with_truth(long, ["train0"], most=9) == list(range(9))
-
-
-def marks(svg: str) -> list[ET.Element]:
-    return [e for e in ET.fromstring(svg).iter() if len(e) and e[0].tag.endswith("title") and "pixels" in e[0].text]
-
-
-def test_the_diagram_has_a_mark_per_bin_and_the_diagonal(measured: tuple[str, list[Row]], tmp_path: Path) -> None:
-    _, rows = measured
-    make_report(rows, tmp_path, builders={"priors": priors})
-    svg, text = (tmp_path / "priors.svg").read_text(), (tmp_path / "report.md").read_text()
-    assert len(marks(svg)) == sum(len(row["curve"]) for row in rows[:3]) > 0
-    assert DIAGONAL in svg
-    assert "true error, 68 % quantile" in svg
-    assert "| synthetic4, 4 views | mono only |" in text
-    assert "emulated, not predicted" in text
-    assert "What moves: scene flow, and what lies between two instants" in text
 
 
 @pytest.fixture(scope="module")

@@ -9,10 +9,8 @@ import numpy as np
 import pytest
 import torch
 from skimage.metrics import structural_similarity
-from tiny import make_model, make_views
 from torch import Tensor
 
-from d2_plugin.backbones import background as module
 from d2_plugin.backbones.background import Background
 from d2_plugin.gaussians import native_ssim as kernel
 from d2_plugin.gaussians.photometric import photometric_loss, reference_photometric_loss
@@ -191,10 +189,3 @@ def test_a_background_that_is_nan_is_seen() -> None:
     out = found.behind(Render(black[..., None].repeat(1, 1, 3), black, black), view_of(32, 24)).color
     assert out[..., 1].isnan().all()
     assert out[..., 0].isfinite().all()
-
-
-def test_without_a_compiler_the_image_is_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
-    model, view = make_model(background=True), make_views()[0]
-    native = model.render(view).color
-    monkeypatch.setattr(module, "can_composite", lambda *parts: False)
-    torch.testing.assert_close(model.render(view).color, native)

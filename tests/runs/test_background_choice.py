@@ -21,7 +21,6 @@ from d2_plugin.runs.start import TimedPoints
 from d2_plugin.store.store import PriorStore
 
 CAMERAS, FRAMES, HEIGHT, WIDTH = ("train0", "train1"), (0, 1), 54, 96
-PIXELS = HEIGHT * WIDTH
 NO_POINTS = TimedPoints(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
 
 
@@ -31,13 +30,13 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return save_recording(recording, tmp_path_factory.mktemp("scene") / "room")
 
 
-def store(folder: Path, far_pixels: dict[str, int], frames: tuple[int, ...] = FRAMES) -> Path:
-    """A prior with so many far pixels in each camera's images."""
-    made = PriorStore.create(folder, list(far_pixels), list(FRAMES), {"recording": "room"})
-    for camera, count in far_pixels.items():
-        for frame in frames:
+def store(folder: Path, far_pixels: int = 0) -> Path:
+    """A prior with so many far pixels in each image."""
+    made = PriorStore.create(folder, list(CAMERAS), list(FRAMES), {"recording": "room"})
+    for camera in CAMERAS:
+        for frame in FRAMES:
             labels = np.full((HEIGHT, WIDTH), Label.VERIFIED, np.uint8)
-            labels.flat[:count] = Label.FAR
+            labels.flat[:far_pixels] = Label.FAR
             sigma = np.where(labels == Label.FAR, np.inf, 0.01).astype(np.float32)
             colors = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
             prior = FusedPrior(np.full((HEIGHT, WIDTH), 3, np.float32), labels, sigma, colors)
@@ -58,7 +57,7 @@ def trainer_of(run: Run) -> object:
 def test_there_is_one_with_and_without_d2_so_that_runs_compare(
     scene: Path, tmp_path: Path, hooks: tuple[str, ...]
 ) -> None:
-    run = run_of(scene, tmp_path / "run", store(tmp_path / "priors", dict.fromkeys(CAMERAS, 0)), hooks=hooks)
+    run = run_of(scene, tmp_path / "run", store(tmp_path / "priors"), hooks=hooks)
     assert trainer_of(run).model.background is not None
 
 
@@ -71,44 +70,32 @@ def test_it_begins_with_the_colours_of_the_images(scene: Path, tmp_path: Path) -
         torch.testing.assert_close(shown.mean((0, 1)), mean, atol=0.1, rtol=0)
 
 
-def test_a_user_decides_otherwise(scene: Path, tmp_path: Path) -> None:
-    off = run_of(scene, tmp_path / "off", None, hooks=(), overrides={"backbone": {"background": False}})
-    assert trainer_of(off).model.background is None
-
-
 def test_a_backbone_of_somebody_else_is_not_asked_for_what_it_need_not_know(
     scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    run = run_of(scene, tmp_path / "run", store(tmp_path / "priors", dict.fromkeys(CAMERAS, 0)))
+    run = run_of(scene, tmp_path / "run", store(tmp_path / "priors"))
     given = []
     monkeypatch.setattr(yang4d, "create", lambda *points, **options: given.append(options) or make_model())
     trainer_of(run)
     assert given[0]["settings"] == {}
 
 
-class TestAFinishedRun:
-    @pytest.fixture
-    def trained(self, scene: Path, tmp_path: Path) -> Run:
-        """Trained with a sky, and its prior damaged afterwards."""
-        run = run_of(scene, tmp_path / "run", store(tmp_path / "priors", dict.fromkeys(CAMERAS, PIXELS // 2)))
-        NO_POINTS.save(run.folder / "points.npz")
-        trainer = trainer_of(run)
-        trainer.run()
-        run._save(trainer)
-        (tmp_path / "priors" / "store.json").write_text('{"format": 0}')
-        return Run.load(run.folder)
-
-    def test_the_checkpoint_says_whether_there_is_a_background(self, trained: Run) -> None:
-        model = trained.trained().model
-        assert model.background is not None
-        assert trained.evaluate(images=False)["background"] is True
-        assert model.background.constant.detach().any()
-
-    def test_a_held_out_camera_is_rendered_with_it(self, trained: Run) -> None:
-        model = trained.trained().model
-        render = renderer(model, trained.scene.recording, "cpu")
-        color, depth = render("test0", 0)
-        model.background = None
-        without, same_depth = render("test0", 0)
-        assert not torch.equal(color, without)
-        assert torch.equal(depth, same_depth)
+def test_a_finished_run_keeps_it_whatever_became_of_its_prior_and_renders_held_out_cameras_with_it(
+    scene: Path, tmp_path: Path
+) -> None:
+    run = run_of(scene, tmp_path / "run", store(tmp_path / "priors", HEIGHT * WIDTH // 2))
+    NO_POINTS.save(run.folder / "points.npz")
+    trainer = trainer_of(run)
+    trainer.run()
+    run._save(trainer)
+    (tmp_path / "priors" / "store.json").write_text('{"format": 0}')
+    finished = Run.load(run.folder)
+    assert finished.evaluate(images=False)["background"] is True
+    model = finished.trained().model
+    assert model.background.constant.detach().any()
+    render = renderer(model, finished.scene.recording, "cpu")
+    color, depth = render("test0", 0)
+    model.background = None
+    without, same_depth = render("test0", 0)
+    assert not torch.equal(color, without)
+    assert torch.equal(depth, same_depth)

@@ -20,7 +20,7 @@ from d2_plugin.runs.report.page import Image
 from d2_plugin.runs.report.quality import groups_of, scores_table
 from d2_plugin.runs.report.report import BUILDERS, ReportSettings, collect, make_report, run
 from d2_plugin.runs.report.run_folders import training_row
-from d2_plugin.runs.report.svg import Axis, Plot, Point, Series, figure, number
+from d2_plugin.runs.report.svg import Axis
 from d2_plugin.runs.rows import Row, append_rows, make_row, named_by_cameras, read_rows
 from d2_plugin.runs.saved import METRICS, RUN
 from d2_plugin.runs.settings import RunSettings
@@ -84,13 +84,6 @@ def test_every_kind_becomes_a_section_with_device_commit_and_command(report: Pat
         assert f'<section id="{kind}">' in page
         assert f'href="#{kind}"' in page
         assert re.search(r"threads, torch .*, commit .*, `d2 .*`\.", section), section[:40]
-
-
-def test_the_page_begins_with_a_picture_of_quality_against_minutes(report: Path) -> None:
-    top = (report / "report.md").read_text().partition("\n| ")[0]
-    assert "](quality.svg)" in top
-    drawn = (report / "quality.svg").read_text()
-    assert all(f">{name}</text>" in drawn for name in ("D²", "backbone alone", "pearson"))
 
 
 def test_the_same_rows_make_the_same_bytes_and_nothing_is_typed_in(report: Path, tmp_path: Path) -> None:
@@ -245,26 +238,6 @@ def test_any_range_of_values_has_an_axis_with_its_ticks_inside(values: list[floa
     assert all(0 < axis.place(value) < 1 for value in values)
     assert 1 <= len(axis.ticks()) <= 20
     assert all(axis.low <= value <= axis.high for value, _ in axis.ticks())
-
-
-def test_ticks_are_round_and_numbers_short() -> None:
-    assert [text for _, text in Axis("y", 0, 10).ticks(5)] == ["0", "2", "4", "6", "8", "10"]
-    assert [number(v) for v in (0.0, 0.5, 1e-6, 2.5e-7, 1e5)] == ["0", "0.5", "10⁻⁶", "2.5·10⁻⁷", "10⁵"]
-
-
-def test_marks_lie_inside_the_image_and_carry_their_numbers() -> None:
-    points = (Point(1.0, 2.0, "the first"), Point(3.0, 4.0, "the <second>"))
-    series = Series("one", points, ((1.0, 2.0), (3.0, 4.0)))
-    limit = Series("limit", (), ((1.0, 2.0), (3.0, 2.0)), color=1, hollow=True)
-    plot = Plot("title", Axis.around("x", [1, 3]), Axis.around("y", [2, 4]), (series, limit))
-    drawn = figure([plot, plot], "two plots", columns=2, size=(340, 300))
-    root = ET.fromstring(drawn)
-    width, height = float(root.attrib["width"]), float(root.attrib["height"])
-    circles = [e for e in root.iter() if e.tag.endswith("circle") and len(e)]
-    assert len(circles) == 4
-    assert all(0 < float(c.attrib["cx"]) < width and 0 < float(c.attrib["cy"]) < height for c in circles)
-    assert {c[0].text for c in circles} == {"the first", "the <second>"}
-    assert drawn.count("stroke-dasharray") == 3, "a bare line is a line in the legend"
 
 
 def scored_run(gaussians: int = 1, **test: float | None) -> dict[str, Any]:

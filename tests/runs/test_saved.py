@@ -86,13 +86,10 @@ class TestADamagedFile:
             read_metrics(copied)
 
     def test_a_checkpoint_of_another_version_is_named(self, copied: Path) -> None:
-        path = copied / "checkpoint.pt"
-        written(path, {"step": 4})
-        with pytest.raises(D2Error, match="has format None but this version reads format 1"):
-            Run.load(copied).evaluate(images=False)
-        written(path, {"format": 9})
-        with pytest.raises(D2Error, match="has format 9"):
-            load_checkpoint(path, "cpu")
+        for state, found in (({"step": 4}, "None"), ({"format": 9}, "9")):
+            written(copied / "checkpoint.pt", state)
+            with pytest.raises(D2Error, match=f"has format {found} but this version reads format 1"):
+                Run.load(copied).evaluate(images=False)
 
     @pytest.mark.parametrize("state", [{}, {"d2": None}, {"d2": 3, "step": "a"}, {"d2": None, "model": {}, "step": 1}])
     def test_a_checkpoint_of_another_shape_is_told(self, copied: Path, state: dict[str, Any]) -> None:
@@ -102,22 +99,17 @@ class TestADamagedFile:
 
     def test_points_of_another_shape_version_or_with_nan_are_told(self, tmp_path: Path) -> None:
         path = tmp_path / "points.npz"
-        wrong = {
-            "shapes": TimedPoints(np.zeros((3, 2)), np.zeros((3, 3)), np.zeros(3)),
-            "not finite": TimedPoints(np.full((3, 3), np.nan), np.zeros((3, 3)), np.zeros(3)),
-        }
-        for reason, points in wrong.items():
-            points.save(path)
-            with pytest.raises(D2Error, match=f"{reason}.*: delete the file, it will be made again"):
+        zeros = np.zeros((3, 3))
+        for positions, reason, form in (
+            (np.zeros((3, 2)), "shapes.*: delete the file, it will be made again", {"format": 1}),
+            (np.full((3, 3), np.nan), "not finite.*: delete the file, it will be made again", {"format": 1}),
+            (np.zeros((3, 3), "U3"), "cannot read points from .*: delete the file", {"format": 1}),
+            (np.zeros((3, 3), "O"), "cannot read points from .*: delete the file", {"format": 1}),
+            (zeros, "format None, expected 1", {}),
+        ):
+            written(path, {"positions": positions, "colors": zeros, "times": np.zeros(3), **form})
+            with pytest.raises(D2Error, match=reason):
                 TimedPoints.load(path)
-        for kind in ("U3", "O"):
-            words = np.zeros((2, 3), kind)
-            written(path, {"positions": words, "colors": words, "times": np.zeros(2), "format": 1})
-            with pytest.raises(D2Error, match="cannot read points from .*: delete the file"):
-                TimedPoints.load(path)
-        written(path, {"positions": np.zeros((0, 3)), "colors": np.zeros((0, 3)), "times": np.zeros(0)})
-        with pytest.raises(D2Error, match="format None, expected 1"):
-            TimedPoints.load(path)
 
 
 class TestARunThatDiverges:
@@ -213,10 +205,9 @@ class TestOneWriter:
 class TestThePriorOfARun:
     """A relative map and one camera: nothing gives its scale, so no view has a prior."""
 
-    ONE = ("--train-cameras", "train0", "--iterations", "4", "--downscale", "1")
-
     def words(self, scene: Path, output: Path, *more: str) -> list[str]:
-        return ["train", str(scene), *self.ONE, "--output", str(output), *more]
+        one = ("--train-cameras", "train0", "--iterations", "4")
+        return ["train", str(scene), *one, "--output", str(output), *more]
 
     def test_none_at_all_is_an_error(self, scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         assert main(self.words(scene, tmp_path / "run")) == 2
@@ -237,10 +228,6 @@ class TestThePriorOfARun:
         assert [refusal["frame"] for refusal in prior["refused"]] == [0, 1]
         assert main(["eval", str(tmp_path / "run"), "--no-images"]) == 0
         assert read_metrics(tmp_path / "run")["prior"] == prior
-
-    def test_without_hooks_none_is_needed(self, scene: Path, tmp_path: Path) -> None:
-        assert main(self.words(scene, tmp_path / "run", "--hooks", "none")) == 0
-        assert read_metrics(tmp_path / "run")["prior"] is None
 
 
 def test_the_checkpoint_before_is_there_when_the_next_cannot_be_written(

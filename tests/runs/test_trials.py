@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,7 +27,7 @@ from d2_plugin.runs.start import TimedPoints
 from d2_plugin.store.store import PriorStore
 
 NETWORK = "mobile_pydnet.onnx"
-CAMERAS, WIDTH, HEIGHT = 3, 160, 90
+TRAINED, WIDTH, HEIGHT = ("train0", "train1", "train2"), 160, 90
 NO_POINTS = TimedPoints(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
 GOOD, BAD = Score(0.8, 24.0), Score(0.7, 25.0)
 
@@ -86,14 +87,14 @@ def test_however_many_cameras_there_are_two_are_left_out_so_that_trials_cost_the
 
 @pytest.fixture(scope="module")
 def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    recording = synthetic_recording(cameras=CAMERAS, frames=3, width=WIDTH, height=HEIGHT)
+    recording = synthetic_recording(cameras=3, held_out=0, frames=3, width=WIDTH, height=HEIGHT)
     return save_recording(recording, tmp_path_factory.mktemp("scene") / "room")
 
 
-def stored(folder: Path, recording: Recording, cameras: tuple[str, ...], wrong: float) -> Path:
+def stored(folder: Path, recording: Recording, wrong: float) -> Path:
     """True depth, verified at the left edge; elsewhere mono-only, and a factor exp(`wrong`) too near or too far."""
-    made = PriorStore.create(folder, list(cameras), list(recording.frames), {"recording": "room"})
-    for number, camera in enumerate(cameras):
+    made = PriorStore.create(folder, list(TRAINED), list(recording.frames), {"recording": "room"})
+    for number, camera in enumerate(TRAINED):
         for frame in recording.frames:
             truth = recording.depth(camera, frame)
             assert truth is not None
@@ -110,18 +111,10 @@ def stored(folder: Path, recording: Recording, cameras: tuple[str, ...], wrong: 
 def test_depth_that_is_right_is_believed_and_depth_that_is_not_is_not_whatever_its_sigma(
     room: Path, tmp_path: Path, wrong: float, choice: str
 ) -> None:
-    cameras = tuple(open_recording(room).cameras)[:CAMERAS]
-    settings = RunSettings(str(room), cameras)
+    settings = RunSettings(str(room), TRAINED)
     scene = Run(settings, tmp_path / "run").scene
-    store = PriorStore.open(stored(tmp_path / "priors", scene.recording, cameras, wrong))
+    store = PriorStore.open(stored(tmp_path / "priors", scene.recording, wrong))
     assert leave_out_in_turn(settings, scene, NO_POINTS, store).choice == choice
-
-
-def with_both_sources(run: Run) -> None:
-    """Give the plan a matched and a monocular depth."""
-    both = run.scene.plan.with_decision(Decision("stereo", True, "told")).measured
-    plan = replace(run.scene.plan, measured=both, mono_source="maps", mono_kind="relative")
-    run.scene = replace(run.scene, plan=plan)
 
 
 @pytest.fixture
@@ -139,72 +132,75 @@ def tried(monkeypatch: pytest.MonkeyPatch) -> list[RunSettings]:
     return made
 
 
-def test_the_user_may_choose_and_then_nothing_is_tried(room: Path, tmp_path: Path, tried: list[RunSettings]) -> None:
-    cameras = tuple(open_recording(room).cameras)[:CAMERAS]
-    priors = str(stored(tmp_path / "priors", open_recording(room), cameras, 0.0))
-    settings = RunSettings(str(room), cameras, iterations=300, priors=priors)
-    for number, changes in enumerate(
-        (
-            {"overrides": {"d2": {"believe": "all"}}},
-            {"overrides": {"priors": {"variant": "mvs"}}},
-            {"hooks": ("prior",)},
-            {"iterations": 299},
-        )
-    ):
-        run = Run(replace(settings, **changes), tmp_path / str(number))
-        with_both_sources(run)
-        run.prepare()
-        assert run.trials is None, changes
+@pytest.fixture
+def settings(room: Path, tmp_path: Path) -> RunSettings:
+    """Of a run that makes trials: long enough, with three cameras and a prior."""
+    priors = stored(tmp_path / "priors", open_recording(room), 0.0)
+    return RunSettings(str(room), TRAINED, iterations=300, priors=str(priors))
+
+
+def run_of(settings: RunSettings, folder: Path) -> Run:
+    """A run whose plan has a matched and a monocular depth."""
+    run = Run(settings, folder)
+    both = run.scene.plan.with_decision(Decision("stereo", True, "told")).measured
+    plan = replace(run.scene.plan, measured=both, mono_source="maps", mono_kind="relative")
+    run.scene = replace(run.scene, plan=plan)
+    return run
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"overrides": {"d2": {"believe": "all"}}},
+        {"overrides": {"priors": {"variant": "mvs"}}},
+        {"hooks": ("prior",)},
+        {"iterations": 299},
+    ],
+    ids=str,
+)
+def test_the_user_may_choose_and_then_nothing_is_tried(
+    settings: RunSettings, tmp_path: Path, tried: list[RunSettings], changes: dict[str, Any]
+) -> None:
+    run = run_of(replace(settings, **changes), tmp_path / "run")
+    run.prepare()
+    assert run.trials is None
     assert not tried
 
 
 def test_one_of_two_cameras_would_train_alone_so_two_cameras_get_no_trial(room: Path, tmp_path: Path) -> None:
-    cameras = tuple(open_recording(room).cameras)[:CAMERAS]
-    run = Run(RunSettings(str(room), cameras), tmp_path / "run")
-    with_both_sources(run)
+    run = run_of(RunSettings(str(room), TRAINED), tmp_path / "run")
     assert can_decide(run.scene)
-    assert not can_decide(replace(run.scene, train_cameras=cameras[:2]))
+    assert not can_decide(replace(run.scene, train_cameras=TRAINED[:2]))
 
 
 def test_what_one_run_tried_serves_every_trainer_with_that_prior_until_the_prior_changes(
-    room: Path, tmp_path: Path, tried: list[RunSettings]
+    settings: RunSettings, tmp_path: Path, tried: list[RunSettings]
 ) -> None:
-    recording = open_recording(room)
-    cameras = tuple(recording.cameras)[:CAMERAS]
-    priors = stored(tmp_path / "priors", recording, cameras, 0.0)
-    settings = RunSettings(str(room), cameras, iterations=300, priors=str(priors), seed=3, backbone="deform")
-    for number, run_settings in enumerate((settings, replace(settings, iterations=3))):
-        run = Run(run_settings, tmp_path / str(number))
-        with_both_sources(run)
+    first = replace(settings, seed=3, backbone="deform")
+    for number, run_settings in enumerate((first, replace(first, iterations=3))):
+        run = run_of(run_settings, tmp_path / str(number))
         run.prepare()
         assert run.trials is not None
         assert run.trials["choice"] == "stereo"
     assert [(one.seed, one.backbone) for one in tried] == [(0, "yang4d")]
-    store = PriorStore.open(priors)
+    store = PriorStore.open(tmp_path / "priors")
     assert PriorLoader(store).believe == "stereo"
     assert "of no use" in PriorLoader(store).verdict
     assert PriorLoader(store, believe="all").believe == "all", "the user's own word stands"
     maps = (np.zeros((HEIGHT, WIDTH), kind) for kind in (np.float32, np.uint8, np.float32))
-    empty = FusedPrior(*maps, recording.image(cameras[0], recording.frames[0]))
-    store.write(cameras[0], recording.frames[0], empty, {"key": "another", "shares": empty.shares()})
-    assert PriorLoader(PriorStore.open(priors)).believe == "all", "of another prior nothing is known"
+    empty = FusedPrior(*maps, np.zeros((HEIGHT, WIDTH, 3), np.uint8))
+    store.write(TRAINED[0], 0, empty, {"key": "another", "shares": empty.shares()})
+    assert PriorLoader(PriorStore.open(tmp_path / "priors")).believe == "all", "of another prior nothing is known"
 
 
 def test_a_run_that_is_scored_again_still_says_what_was_tried(
-    room: Path, tmp_path: Path, tried: list[RunSettings]
+    settings: RunSettings, tmp_path: Path, tried: list[RunSettings]
 ) -> None:
-    recording = open_recording(room)
-    cameras = tuple(recording.cameras)[:CAMERAS]
-    priors = stored(tmp_path / "priors", recording, cameras, 0.0)
-    settings = RunSettings(str(room), cameras, iterations=3, priors=str(priors))
-    longer = Run(replace(settings, iterations=300), tmp_path / "longer")
-    with_both_sources(longer)
-    longer.prepare()
-    run = Run(settings, tmp_path / "run")
-    with_both_sources(run)
-    run.train()
-    (priors / "trials.json").unlink()
-    metrics = Run(settings, tmp_path / "run").evaluate(images=False)
+    run_of(settings, tmp_path / "longer").prepare()
+    short = replace(settings, iterations=3)
+    run_of(short, tmp_path / "run").train()
+    (tmp_path / "priors" / "trials.json").unlink()
+    metrics = Run(short, tmp_path / "run").evaluate(images=False)
     assert metrics["trials"]["choice"] == "stereo"
     assert D2Config.from_toml(tmp_path / "run" / "d2.toml").believe == "stereo"
 
