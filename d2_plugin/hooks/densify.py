@@ -19,9 +19,6 @@ from d2_plugin.settings import Count, Every, Positive, Range, Share, Steps
 
 log = logging.getLogger(__name__)
 
-AT_LEAST = 5
-"""Steps from one evaluation to the next in the shortest runs."""
-
 SIGMAS = 2.5
 """A pixel also counts as under-reconstructed only beyond this many standard deviations of its depth."""
 
@@ -83,7 +80,7 @@ class DensifyConfig(HookConfig):
     @classmethod
     def for_iterations(cls, iterations: int) -> DensifyConfig:
         """Insertion from the first fortieth to half of the run, in numbers that the run has time to train."""
-        every = steps_between_evaluations(iterations, AT_LEAST)
+        every = steps_between_evaluations(iterations)
         start = max(1, min(every, iterations // 40))
         return cls(start=start, stop=max(iterations // 2, every + 1), every=every, budget_per_view=10 * iterations)
 
@@ -212,9 +209,7 @@ class Densify(Hook):
             if budget > 0:
                 points = self._propose(surveyed, inserted, budget, context.generator, lives)
                 inserted += [points] if len(points.positions) else []
-        if not inserted:
-            return None
-        return Edit(insert=Points.joined(inserted))
+        return Edit(insert=Points.joined(inserted)) if inserted else None
 
     def _propose(
         self,

@@ -58,10 +58,10 @@ class HookConfig(Settings):
         return Window(self.start, self.stop, self.every)
 
 
-def steps_between_evaluations(iterations: int, least: int) -> int:
-    """Of hooks that edit structure: a hundred, in short runs a twentieth of the run, or a tenth and ten; `least` at
-    least. An evaluation costs as much as several steps."""
-    return max(least, min(10, iterations // 10), min(100, iterations // 20))
+def steps_between_evaluations(iterations: int) -> int:
+    """Of hooks that edit structure: a hundred; a twentieth of a run below 2000 steps, ten below 200, a tenth below 100,
+    and no fewer than five. An evaluation costs as much as several steps."""
+    return max(5, min(10, iterations // 10), min(100, iterations // 20))
 
 
 class Surveyed(NamedTuple):

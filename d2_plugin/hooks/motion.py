@@ -45,11 +45,6 @@ class MotionConfig(HookConfig):
     insert: bool = True
     """Whether `densify` also inserts what moves at instants halfway."""
 
-    @classmethod
-    def for_iterations(cls, iterations: int) -> MotionConfig:
-        """From a third of the run on: before that there is little that could move."""
-        return cls(start=max(1, iterations // 3))
-
 
 class Motion(Hook):
     """Adds the photometric loss between each view of the present step and the same camera's next instant."""

@@ -59,7 +59,7 @@ class PruneConfig(HookConfig):
     def for_iterations(cls, iterations: int) -> PruneConfig:
         """Pruning from a fifth to two thirds of the run, then of what floats up to the last twentieth. Runs of less
         than about a hundred iterations are too short to gather evidence in, and nothing is pruned there."""
-        every = steps_between_evaluations(iterations, AT_LEAST)
+        every = max(AT_LEAST, steps_between_evaluations(iterations))
         score_stop, stop = 2 * iterations // 3, 19 * iterations // 20
         return cls(start=iterations // 5, stop=stop, score_stop=score_stop, every=every)
 

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from tiny import ALL_HOOKS, HEIGHT, WIDTH, TinyStore, make_adapter, make_model, make_views
 
 from d2_plugin import hooks
-from d2_plugin.config import DensifyConfig, MotionConfig, PruneConfig
+from d2_plugin.config import DensifyConfig, PruneConfig
 from d2_plugin.hooks.densify import Densify, back_project
 from d2_plugin.hooks.hook import Context, Window
 from d2_plugin.hooks.prior import PriorLoader
@@ -124,7 +124,6 @@ def test_a_schedule_inserts_early_and_leaves_half_of_the_run_to_train(iterations
     assert insert.start < insert.stop <= iterations / 2 + insert.every + 1
     assert remove.every >= 10
     assert insert.every >= min(10, iterations / 10)
-    assert MotionConfig.for_iterations(iterations).start == max(1, iterations // 3)
 
 
 FILE_OF_THE_HOOK = """
