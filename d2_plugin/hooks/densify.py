@@ -82,7 +82,8 @@ class DensifyConfig(HookConfig):
         """Insertion from the first fortieth to half of the run, in numbers that the run has time to train."""
         every = steps_between_evaluations(iterations)
         start = max(1, min(every, iterations // 40))
-        return cls(start=start, stop=max(iterations // 2, every + 1), every=every, budget_per_view=10 * iterations)
+        budget = max(10 * iterations, 200 * every)
+        return cls(start=start, stop=max(iterations // 2, every + 1), every=every, budget_per_view=budget)
 
 
 def under_reconstructed(depth: Tensor, valid: Tensor, prior: Tensor, support: Tensor, tau_u: float | Tensor) -> Tensor:
@@ -249,8 +250,7 @@ class Densify(Hook):
     def _interval_everywhere(self, view: View, context: Context) -> Tensor | None:
         """The same [H, W] halfway between instants, where whatever has a depth moves."""
         interval = _interval(context.instants(view.camera))
-        like = view.T_camera_world
-        lifetime = self.config.lifetime
+        like, lifetime = view.T_camera_world, self.config.lifetime
         return None if lifetime is None else like.new_full((view.height, view.width), lifetime * interval)
 
     def _tau_u(self, prior: DepthPrior) -> Tensor:

@@ -124,6 +124,7 @@ def test_a_schedule_inserts_early_and_leaves_half_of_the_run_to_train(iterations
     assert insert.start < insert.stop <= iterations / 2 + insert.every + 1
     assert remove.every >= 10
     assert insert.every >= min(10, iterations / 10)
+    assert insert.budget_per_view >= 10 * iterations
 
 
 FILE_OF_THE_HOOK = """
