@@ -198,7 +198,9 @@ def _ex4dgs(job: Job, extraction: str = "extracton_interval") -> list[str]:
     config = {
         **{"loader": "neural3dvideo", "resolution": 1, "iterations": job.iterations, "lazy_loader": True},
         **{"duration": job.frames, "start_duration": job.frames, "end_timestamp": job.frames},
-        **job.schedule(DENSIFY | {"extract_from_iter": 0.25, extraction: 0.15, "dynamic_position_lr_max_steps": 1.0}),
+        **job.schedule(DENSIFY | {"dynamic_position_lr_max_steps": 1.0}),
+        # Always within the run: a model in which nothing moves yet cannot be saved.
+        **{"extract_from_iter": job.share(0.25), extraction: job.share(0.15)},
         "progressive_growing_steps": 100000,
     }
     path = job.write("config.json", json_text(config, "config.json"))
