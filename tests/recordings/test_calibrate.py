@@ -70,6 +70,13 @@ class TestRefinedPoses:
         assert "the poses stay" in refined.reason
         assert not any(turn.wrong for turn in refined.turns.values())
 
+    def test_matches_that_are_all_wrong_change_nothing(self) -> None:
+        truth = arc(2)
+        given = moved(truth, 1.0, 0.01)
+        refined = refine_poses(given, seen_by(truth, things=80, wrong=1.0))
+        assert not refined.accepted
+        assert refined.cameras == given
+
     def test_a_camera_that_shares_nothing_is_named(self) -> None:
         truth = arc()
         features = seen_by(truth)

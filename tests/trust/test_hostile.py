@@ -54,9 +54,7 @@ export /nope | export VIDEOS | eval /nope | eval /dev/null | compare | compare /
 render | render /nope | render /dev/null | render VIDEOS | bench | bench nope | bench training | bench training x
 bench training /nope@a+b | bench training ROOM@train0+train1 --seconds nan | bench training ROOM@train0@@x
 bench training ROOM@train0+train1 --jobs 9999999 | bench training ROOM@train0+train1 --config /nope --steps 1
-bench training-step --gaussians 1000000000000 | bench training-step --sizes 0x0 | bench training-step --sizes x
-bench training-step --sizes 99999x99999 | bench training-step --threads 1000000000000 | bench gpu --steps nope
-bench training-step --frames 1000000000000 | bench training-step --seconds nan | bench gpu --output /dev/null/x
+bench gpu --steps nope | bench gpu --output /dev/null/x
 stability --sweeps nope | demo --iterations 0 | demo --output /dev/null/x
 export-recording ROOM --format nope --output x | ablate ROOM --train-cameras train0,train1 --rows nope --output x
  export-recording ROOM --format n3dv --output ROOM
