@@ -81,7 +81,7 @@ def parse_size(text: str) -> tuple[int, int]:
 def _measure(case: Case, settings: RasterBench, command: str) -> list[Row]:
     scene, device = case.load(), torch.device(settings.device)
     gaussians = len(scene.means)
-    truth = exact(scene) if gaussians <= settings.error_limit else None
+    truth = exact(scene, device) if gaussians <= settings.error_limit else None
     rows = []
     for name, render in implementations(device, gaussians).items():
         passes = passes_of(render, scene, device)

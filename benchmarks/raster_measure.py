@@ -65,9 +65,9 @@ def _gsplat(scene: Scene) -> Render:
 
 
 def implementations(device: torch.device, gaussians: int) -> dict[str, RenderScene]:
-    """What is compared on `device`: this package, the torch path up to `REFERENCE_LIMIT`, gsplat where installed."""
+    """What is compared: this package; on the CPU the torch path up to `REFERENCE_LIMIT`, on a GPU gsplat."""
     found: dict[str, RenderScene] = {"d2": _d2}
-    if gaussians <= REFERENCE_LIMIT:
+    if device.type == "cpu" and gaussians <= REFERENCE_LIMIT:
         found["torch reference"] = _reference
     if device.type == "cuda" and importlib.util.find_spec("gsplat"):
         found["gsplat"] = _gsplat
@@ -149,9 +149,9 @@ class Truth(NamedTuple):
     scene: Scene
 
 
-def exact(scene: Scene) -> Truth:
-    """Image of the reference in float64."""
-    leaves = scene.leaves(torch.float64)
+def exact(scene: Scene, device: torch.device) -> Truth:
+    """Image of the reference in float64, computed on `device`."""
+    leaves = scene.leaves(torch.float64, device)
     return Truth(_reference(leaves), leaves)
 
 
@@ -166,17 +166,19 @@ def error_of(render: RenderScene, scene: Scene, device: torch.device, truth: Tru
     leaves = scene.leaves(torch.float32, device)
     found = render(leaves)
     pairs = zip(found[:3], truth.render[:3])
-    deviations = [(part.detach().cpu().double() - true.detach()).abs() for part, true in pairs]
+    deviations = [(part.detach().double() - true.detach()).abs().cpu() for part, true in pairs]
     apart = (deviations[0].amax(-1) > THRESHOLD_DEVIATION) | (deviations[2] > THRESHOLD_DEVIATION)
     kept = (~apart[..., None], ~apart, ~apart)
     weights = [torch.where(keep, weight, 0) for keep, weight in zip(kept, upstream(scene))]
     gradients = torch.autograd.grad(found[:3], leaves[:4], [w.to(device) for w in weights])
-    expected = torch.autograd.grad(truth.render[:3], truth.scene[:4], [w.double() for w in weights], retain_graph=True)
+    upon = [w.to(device).double() for w in weights]
+    expected = torch.autograd.grad(truth.render[:3], truth.scene[:4], upon, retain_graph=True)
     errors = {
         name: {**_quantiles(deviation), "over_1e-4": (deviation > 1e-4).double().mean().item()}
         for name, deviation in zip(Render._fields, deviations)
     }
     for name, part, true in zip(GRADIENTS, gradients, expected):
+        true = true.cpu()
         deviation = part.cpu().double() - true
         scale = true.square().mean().sqrt().clamp(min=1e-300)
         relative = deviation.norm() / true.norm().clamp(min=1e-300)

@@ -90,8 +90,8 @@ class Step(NamedTuple):
     def words(self, settings: GpuBench) -> list[str]:
         """The command of this machine."""
         python = shlex.quote(sys.executable)
-        programs = {"bench": f"{python} -m benchmarks", "pytest": f"{python} -m pytest -q"}
-        programs["d2"] = shlex.quote(str(Path(sys.executable).with_name("d2")))
+        modules = {"bench": "benchmarks", "d2": "d2_plugin", "pytest": "pytest -q -n 0"}  # one process for one device
+        programs = {name: f"{python} -m {module}" for name, module in modules.items()}
         given = {name: shlex.quote(str(value)) for name, value in vars(settings).items()}
         return shlex.split(self.command.format(**programs, **given))
 
@@ -103,6 +103,7 @@ def _sanitizer(tool: str) -> Step:
     return Step(120, needs, f"compute-sanitizer --tool {tool} --error-exitcode 9 {chosen}")
 
 
+TESTED = "tests/rasterizer tests/stability tests/priors/test_patchmatch_gpu.py"
 RASTER = "{bench} raster --device cuda --output {output}/"
 STEREO = "{bench} stereo --device cuda --defaults-only --rigs synthetic4 --width 640 --output {output}/"
 TRAIN = "{d2} train {recording} --train-cameras {train_cameras} --iterations {iterations} --output {output}/train-"
@@ -110,11 +111,12 @@ PROFILE = "ncu --set basic -k 'regex:d2_(render|backward|survey)$' -c 6 -f -o {o
 
 STEPS = {
     "static": Step(100, (_program("nvcc"),), ""),
-    "tests": Step(180, (_device, _tests), "{pytest} -m cuda tests"),
+    "tests": Step(180, (_device, _tests), f"{{pytest}} -m cuda {TESTED}"),
     **{tool: _sanitizer(tool) for tool in ("memcheck", "racecheck", "initcheck")},
     "raster": Step(
         *(240, (_device,)),
-        f"{RASTER}raster.jsonl --seconds 2 --sizes 640x360,1920x1080 --scenes synth:50000,synth:200000,synth:1000000",
+        f"{RASTER}raster.jsonl --seconds 1 --sizes 640x360,1920x1080 --scenes synth:10000,synth:200000,synth:1000000 "
+        "--error-limit 10000",
     ),
     "stereo-cuda": Step(60, (_device,), f"{STEREO}stereo-cuda.jsonl"),
     "train-cuda": Step(150, (_device, _recording), f"{TRAIN}cuda --device cuda"),

@@ -47,7 +47,7 @@ class GaussianModel(ex4dgs.GaussianModel):
         rotation = nn.functional.normalize(torch.cat([self._rotation, turned]))
         child = torch.nonzero(self._level[:, 0] != 0).squeeze(1)
         parent = self._parent[child, 0]
-        q, v = rotation[parent], torch.cat([torch.zeros(len(child), 1), xyz[child]], 1)
+        q, v = rotation[parent], torch.cat([xyz.new_zeros(len(child), 1), xyz[child]], 1)
         carried = product(product(q, v), q * q.new_tensor([1.0, -1, -1, -1]))[:, 1:]
         xyz = xyz.index_copy(0, child, xyz[parent] + carried)
         return xyz, rotation.index_copy(0, child, product(q, rotation[child]))

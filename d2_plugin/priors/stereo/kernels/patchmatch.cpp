@@ -35,8 +35,18 @@ void parallel_rows(int rows, int threads, const Work& work) {
   for (std::thread& other : others) other.join();
 }
 
-// Grey values of the reference with a margin, so that all windows are read alike, what samples weigh, and where other
-// pixels lie.
+// Where the pixels of a region lie, worked out by the compiler: GCC 13 vectorizes this loop wrongly, and places move.
+struct Places {
+  int dx[kRegions][kMostPlaces] = {}, dy[kRegions][kMostPlaces] = {};
+
+  constexpr Places() {
+    for (int region = 0; region < kRegions; region++)
+      for (int n = 0; n < region_size(region); n++) region_place(region, n, dx[region][n], dy[region][n]);
+  }
+};
+constexpr Places kPlaces;
+
+// Grey values of the reference with a margin, so that all windows are read alike, and what samples weigh.
 struct Reference {
   static constexpr int kMargin = 5;
   static constexpr int kGrays = 256, kDistances = 5;  // of samples from the middle of a window
@@ -44,7 +54,6 @@ struct Reference {
   std::vector<unsigned> levels;                // -1 outside of the image
   int offset[kSamples];                        // of the samples, in `levels`
   alignas(64) float weight[kDistances][2 * kGrays];  // by distance and difference of grey values, from -256 on
-  int dx[kRegions][kMostPlaces], dy[kRegions][kMostPlaces];
 
   explicit Reference(const Task& t)
       : stride(t.width + 2 * kMargin), levels(size_t(stride) * (t.height + 2 * kMargin), ~0u) {
@@ -58,8 +67,6 @@ struct Reference {
         weight[distance(n)][k] = exp2_of(mad(off * off, t.per_gray, log2_spatial(du, dv)));
       }
     }
-    for (int region = 0; region < kRegions; region++)
-      for (int n = 0; n < region_size(region); n++) region_place(region, n, dx[region][n], dy[region][n]);
   }
   // Squared distances are 2, 10, 18, 26 and 34.
   static int distance(int sample) {
@@ -237,12 +244,12 @@ class Batch {
 };
 
 // cheapest_of for the pixels at `columns` and `rows`.
-Integers cheapest_of(const Task& t, const Reference& reference, Integers columns, Integers rows, int region) {
+Integers cheapest_of(const Task& t, Integers columns, Integers rows, int region) {
   const Integers here = rows * t.width + columns;
   Floats lowest = all<Floats>(1e9f);
   Integers found = Integers{} - 1;
   for (int n = 0; n < region_size(region); n++) {
-    const int dx = reference.dx[region][n], dy = reference.dy[region][n];
+    const int dx = kPlaces.dx[region][n], dy = kPlaces.dy[region][n];
     // As if they had no sign, numbers below 0 are large.
     const Unsigneds x = (Unsigneds)(columns + dx), y = (Unsigneds)(rows + dy);
     const Integers inside = (Integers)(x < unsigned(t.width)) & (Integers)(y < unsigned(t.height));
@@ -302,7 +309,7 @@ void update_rows(const Task& t, const Reference& reference, const float* first_c
     for (int n = 0; n < count; n++)
       if (!textured(n)) t.costs[turn.pixel[n]] = kNoMatch;
     if (!batch.lanes()) return;
-    turn.gather([&](int region) { return cheapest_of(t, reference, batch.columns(), batch.rows(), region); });
+    turn.gather([&](int region) { return cheapest_of(t, batch.columns(), batch.rows(), region); });
     const int known = round == 0 ? 1 : 0;  // nobody else has changed the plane that a pixel starts with
     for (int s = 0; s < t.source_count * known; s++)
       batch.know(0, s, look_up(first_costs + size_t(s) * t.width * t.height, turn.pixel));
