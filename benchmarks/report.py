@@ -25,8 +25,8 @@ PLOTTED_ANCHORS = 20_000
 """Number of anchors that is plotted, or the nearest one that was measured."""
 
 GPU = (
-    "Static analysis is what the compiler says of a kernel, and no measurement: nothing here has run on a GPU "
-    "unless a step below says so."
+    "Static analysis is what the compiler says of a kernel, and no measurement; what ran on a GPU is on "
+    "[a page of its own](gpu.md)."
 )
 STABILITY = (
     "Each parameter is swept to where other codebases break. ok: the error is below the sweep's limit; gap: it is "
