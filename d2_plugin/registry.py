@@ -24,6 +24,8 @@ def names(group: str) -> list[str]:
 def load(group: str, name: str) -> Any:
     """The registered object of that name; an unknown name is refused, with the known ones."""
     points = _points(group)
+    if not points:
+        raise D2Error("this Python has no installed d2-4dgs: run `pip install -e .` in its checkout")
     refuse_unknown(group.rsplit(".", 1)[1].removesuffix("s"), [name], points)
     try:
         return points[name].load()

@@ -9,6 +9,7 @@ import importlib.metadata
 import importlib.util
 import os
 import platform
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -71,7 +72,8 @@ def report() -> str:
         f"cache       {compiler.cache_folder()}",
         f"backbones   {', '.join(registry.names(registry.BACKBONES))}",
     ]
-    lines += [f"{module:12}{_state(module, extra, purpose)}" for module, (extra, purpose) in OPTIONAL.items()]
+    known = importlib.metadata.packages_distributions()
+    lines += [f"{module:12}{_state(known.get(module, [module]), module, *why)}" for module, why in OPTIONAL.items()]
     return "\n".join(lines)
 
 
@@ -84,8 +86,7 @@ def _compiler() -> str:
         return f"none: {error}"
 
 
-def _state(module: str, extra: str, purpose: str) -> str:
+def _state(names: Sequence[str], module: str, extra: str, purpose: str) -> str:
     if importlib.util.find_spec(module) is None:
-        return f"missing: no {purpose}; run `pip install 'd2-4dgs[{extra}]'`"
-    names = importlib.metadata.packages_distributions().get(module, [module])
+        return f"missing, needed for {purpose}: run `pip install 'd2-4dgs[{extra}]'`"
     return f"{importlib.metadata.version(names[0])} ({purpose})"

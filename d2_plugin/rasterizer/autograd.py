@@ -61,7 +61,7 @@ def survey(
     depth, counted, edge = (_map(part, means) for part in (prior.depth, reliability(prior), near_edge))
     kernels = _kernels(means)
     camera = (view.T_camera_world, view.K, view.width, view.height)
-    frame = kernels.frame_of(means, covariances, opacities, *camera, constants_of(settings), 0)
+    frame = kernels.frame_of(means, covariances, opacities, camera, constants_of(settings), 0)
     frame.pointing(prior_depth=depth, reliability=counted, near_edge=edge).eps = eps
     kernels.project(frame, means, view.K)
     weight, error, max_weight, front = (torch.empty_like(opacities) for _ in range(4))
@@ -135,7 +135,7 @@ class _Rasterize(torch.autograd.Function):
 def _frame(inputs: Sequence[Tensor], width: int, height: int, constants: list[float]) -> tuple[ModuleType, Any]:
     means, covariances, opacities, colors, background, screen_offsets, *camera, near_edge = inputs
     kernels = _kernels(means)
-    frame = kernels.frame_of(means, covariances, opacities, *camera, width, height, constants, colors.shape[1])
+    frame = kernels.frame_of(means, covariances, opacities, (*camera, width, height), constants, colors.shape[1])
     return kernels, frame.pointing(
         colors=colors, background=background, screen_offsets=screen_offsets, near_edge=near_edge
     )

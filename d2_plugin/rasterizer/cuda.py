@@ -21,7 +21,7 @@ from d2_plugin.compiler.driver import Driver
 from d2_plugin.compiler.kernels import fields
 from d2_plugin.compiler.nvrtc import Binary, NoCuda, Program, build
 from d2_plugin.errors import D2Error
-from d2_plugin.rasterizer.native import KERNELS, RECORD, PointingFrame
+from d2_plugin.rasterizer.native import KERNELS, RECORD, Pinhole, PointingFrame
 
 PROGRAM = Program(KERNELS / "gpu.cu", (KERNELS / "splat.h",))
 
@@ -118,21 +118,14 @@ def available(device: torch.device) -> bool:
 
 
 def frame_of(
-    means: Tensor,
-    covariances: Tensor,
-    opacities: Tensor,
-    T_camera_world: Tensor,
-    K: Tensor,
-    width: int,
-    height: int,
-    constants: list[float],
-    channels: int,
+    means: Tensor, covariances: Tensor, opacities: Tensor, camera: Pinhole, constants: list[float], channels: int
 ) -> Frame:
     """What every call works on; its tensors are kept as long as the frame."""
+    *matrices, width, height = camera
     frame = Frame(width=width, height=height, channels=channels, tiles_x=-(-width // TILE), count=len(means))
     frame.constants[:] = constants
-    camera = (part.to(means, non_blocking=True).contiguous() for part in (T_camera_world, K))
-    frame.pointing(**dict(zip(("T_camera_world", "K"), camera)))
+    there = (part.to(means, non_blocking=True).contiguous() for part in matrices)
+    frame.pointing(**dict(zip(("T_camera_world", "K"), there)))
     return frame.pointing(means=means, covariances=covariances, opacities=opacities)
 
 

@@ -33,6 +33,8 @@ HEADERS = tuple(KERNELS / name for name in ("splat.h", "simd.h", "parallel.h", "
 FLAGS = ("-ffp-contract=off",)
 """The same formula must give the same bits wherever it is inlined; see kernels/simd.h."""
 
+Pinhole = tuple[Tensor, Tensor, int, int]  # T_camera_world, K, width, height
+
 Pointing = TypeVar("Pointing", bound="PointingFrame")
 
 
@@ -93,17 +95,10 @@ def available() -> bool:
 
 
 def frame_of(
-    means: Tensor,
-    covariances: Tensor,
-    opacities: Tensor,
-    T_camera_world: Tensor,
-    K: Tensor,
-    width: int,
-    height: int,
-    constants: list[float],
-    channels: int,
+    means: Tensor, covariances: Tensor, opacities: Tensor, camera: Pinhole, constants: list[float], channels: int
 ) -> Frame:
     """What every call works on; tensors of the Gaussians are kept as long as the frame."""
+    T_camera_world, K, width, height = camera
     frame = Frame(width=width, height=height, channels=channels, count=len(means), threads=torch.get_num_threads())
     frame.chunks = min(4 * frame.threads, max(1, frame.count // 256))
     rows = T_camera_world.tolist()

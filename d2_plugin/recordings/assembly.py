@@ -83,7 +83,7 @@ def assembled(
     `where` names the file that describes the cameras. Images of cameras with a distortion are undistorted when read.
     """
     pinholes = {name: camera.pinhole(where) for name, camera in cameras.items()}
-    kind, emulated, mono_notes = _mono_description(path)
+    kind, emulated = _mono_description(path)
     monos = _maps(path / "mono", cameras, ".npy")
     masks, mask_notes = _masks(path, cameras)
     valid = {name: path / VALID_FOLDER / f"{name}.png" for name in cameras}
@@ -92,7 +92,7 @@ def assembled(
     bent = {name: camera for name, camera in cameras.items() if camera.lens.bends}
     if bent:
         source = UndistortedSource(source, bent)
-    all_notes = (*notes, *mono_notes, *mask_notes, *_lens_notes(bent))
+    all_notes = (*notes, *mask_notes, *_lens_notes(bent))
     for note in all_notes:
         log.info("%s: %s", path.name, note)
     return Recording(
@@ -135,8 +135,8 @@ def _maps(folder: Path, names: Iterable[str], suffix: str | None) -> dict[str, F
     return {name: numbered_files(folder / name, *([(suffix,)] if suffix else [])) for name in there}
 
 
-def _mono_description(path: Path) -> tuple[MonoKind, bool, tuple[str, ...]]:
-    """(kind, emulated, notes) of the maps in mono/."""
+def _mono_description(path: Path) -> tuple[MonoKind, bool]:
+    """(kind, emulated) of the maps in mono/."""
     declared = path / "mono" / "mono.json"
     content = read_json(declared, CORRECT) if declared.exists() else {}
     kind, emulated = content.get("kind", "relative"), content.get("emulated", False)
@@ -145,7 +145,7 @@ def _mono_description(path: Path) -> tuple[MonoKind, bool, tuple[str, ...]]:
             f"{declared} says kind {shown(kind)} and emulated {shown(emulated)}: "
             "expected 'relative' or 'metric', and true or false"
         )
-    return cast(MonoKind, kind), emulated, ("monocular maps are emulated, not predicted",) if emulated else ()
+    return cast(MonoKind, kind), emulated
 
 
 def _map(path: Path, key: str | None) -> np.ndarray:

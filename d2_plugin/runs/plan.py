@@ -69,6 +69,11 @@ class ScenePlan:
         return any(d.use for d in self.decisions if d.name == name)
 
     @property
+    def emulated(self) -> bool:
+        """Whether depth that guides the run was made from true depth, not predicted."""
+        return "(emulated)" in f"{self.mono_source} {self.multiview}"
+
+    @property
     def geometric(self) -> bool:
         """Whether there is geometric depth, matched or measured."""
         return any(d.use for d in self.measured if d.name in ("sensor", "stereo"))

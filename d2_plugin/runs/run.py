@@ -302,7 +302,7 @@ def _about(run: Run, trainer: Any) -> dict[str, Any]:
         "trials": run.trials,
         "plan": scene.plan.as_dict(),
         "recording": scene.recording.name,
-        "mono_emulated": scene.recording.mono_emulated or "(emulated)" in scene.plan.multiview,
+        "mono_emulated": scene.plan.emulated,
         "notes": list(scene.recording.notes),
         "made": circumstances(),
     }

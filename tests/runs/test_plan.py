@@ -55,6 +55,13 @@ def test_what_a_scene_does_not_have_is_left_out(moving, frames, cameras, maps, u
     assert len(cameras) > 1 or plan.as_dict()["stereo"] == {"use": False, "reason": "one training camera"}
 
 
+def test_depth_is_emulated_where_no_network_takes_the_place_of_emulated_maps(moving, tmp_path: Path) -> None:
+    save_recording(moving, tmp_path / "room")
+    settings = RunSettings(str(tmp_path / "room"), PAIR)
+    assert Scene.open(settings).plan.emulated
+    assert not Scene.open(replace(settings, mono_onnx="network.onnx", mono_kind="relative")).plan.emulated
+
+
 def test_no_motion_leaves_the_temporal_dimension_out() -> None:
     still = synthetic_recording(cameras=2, frames=4, width=96, height=54, moving=False)
     assert not plan_scene(still, PAIR, "maps").uses("temporal")

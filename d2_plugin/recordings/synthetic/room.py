@@ -80,7 +80,7 @@ def synthetic_recording(
         source=source,
         mono_kind="relative",
         mono_emulated=True,
-        notes=("rendered, not recorded", "monocular maps are emulated, not predicted"),
+        notes=("rendered, not recorded",),
     )
 
 

@@ -35,16 +35,13 @@ void parallel_rows(int rows, int threads, const Work& work) {
   for (std::thread& other : others) other.join();
 }
 
-// Where the pixels of a region lie, worked out by the compiler: GCC 13 vectorizes this loop wrongly, and places move.
-struct Places {
-  int dx[kRegions][kMostPlaces] = {}, dy[kRegions][kMostPlaces] = {};
-
-  constexpr Places() {
-    for (int region = 0; region < kRegions; region++)
-      for (int n = 0; n < region_size(region); n++) region_place(region, n, dx[region][n], dy[region][n]);
-  }
-};
-constexpr Places kPlaces;
+// Where the pixels of a region lie, worked out by the compiler: GCC 13 vectorizes these loops wrongly, and places move.
+constexpr auto kPlaces = [] {
+  struct { int dx[kRegions][kMostPlaces], dy[kRegions][kMostPlaces]; } places = {};
+  for (int region = 0; region < kRegions; region++)
+    for (int n = 0; n < region_size(region); n++) region_place(region, n, places.dx[region][n], places.dy[region][n]);
+  return places;
+}();
 
 // Grey values of the reference with a margin, so that all windows are read alike, and what samples weigh.
 struct Reference {
