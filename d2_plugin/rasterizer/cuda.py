@@ -21,7 +21,7 @@ from d2_plugin.compiler.driver import Driver
 from d2_plugin.compiler.kernels import fields
 from d2_plugin.compiler.nvrtc import Binary, NoCuda, Program, build
 from d2_plugin.errors import D2Error
-from d2_plugin.rasterizer.native import KERNELS, RECORD, Pinhole, PointingFrame
+from d2_plugin.rasterizer.native import KERNELS, RECORD, SLOWER, Pinhole, PointingFrame
 
 PROGRAM = Program(KERNELS / "gpu.cu", (KERNELS / "splat.h",))
 
@@ -108,11 +108,7 @@ def available(device: torch.device) -> bool:
     try:
         launcher(device)
     except NoCuda as error:
-        warnings.warn(
-            f"{error}. Until then splatting on {device} runs in plain torch: the same images and gradients, but orders "
-            "of magnitude slower and with much more memory.",
-            stacklevel=3,
-        )
+        warnings.warn(f"{error}. Until then splatting on {device} {SLOWER}", stacklevel=3)
         return False
     return True
 

@@ -33,6 +33,8 @@ HEADERS = tuple(KERNELS / name for name in ("splat.h", "simd.h", "parallel.h", "
 FLAGS = ("-ffp-contract=off",)
 """The same formula must give the same bits wherever it is inlined; see kernels/simd.h."""
 
+SLOWER = "runs in plain torch: the same images, but orders of magnitude slower and with much more memory."
+
 Pinhole = tuple[Tensor, Tensor, int, int]  # T_camera_world, K, width, height
 
 Pointing = TypeVar("Pointing", bound="PointingFrame")
@@ -85,11 +87,7 @@ def available() -> bool:
     try:
         library()
     except NoCompiler as error:
-        warnings.warn(
-            f"{error}. Until then splatting runs in plain torch: the same images and gradients, but orders of "
-            "magnitude slower and with much more memory.",
-            stacklevel=4,
-        )
+        warnings.warn(f"{error}. Until then splatting {SLOWER}", stacklevel=4)
         return False
     return True
 
