@@ -110,7 +110,8 @@ class Run:
         with self._writing(), self._timed("priors"):
             points = self._points()
             if self.uses_prior:
-                between = "motion" in self.settings.hooks
+                motion = hook_config(self.settings, self._store).motion
+                between = motion is not None and motion.stop != 1
                 summary = build_priors_for(self.scene, points.positions, self._store, between=between)
                 if on_prior is not None:
                     on_prior(summary)

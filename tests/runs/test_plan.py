@@ -23,7 +23,7 @@ from d2_plugin.recordings.export.ply import PointCloud
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.runs.overlap import measure_overlap, measure_texture
 from d2_plugin.runs.plan import changed_share, plan_scene
-from d2_plugin.runs.run import build_priors_for
+from d2_plugin.runs.run import Run, build_priors_for
 from d2_plugin.runs.scene import Scene
 from d2_plugin.runs.settings import RunSettings
 from d2_plugin.store.store import PriorStore
@@ -60,6 +60,19 @@ def test_depth_is_emulated_where_no_network_takes_the_place_of_emulated_maps(mov
     settings = RunSettings(str(tmp_path / "room"), PAIR)
     assert Scene.open(settings).plan.emulated
     assert not Scene.open(replace(settings, mono_onnx="network.onnx", mono_kind="relative")).plan.emulated
+
+
+@pytest.mark.parametrize(("iterations", "built"), [(199, False), (200, True)])
+def test_flow_is_built_where_the_run_is_long_enough_to_use_it(
+    moving, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, iterations: int, built: bool
+) -> None:
+    def stop(*_: object, between: bool) -> None:
+        raise D2Error(f"between: {between}")
+
+    monkeypatch.setattr("d2_plugin.runs.run.build_priors_for", stop)
+    settings = RunSettings(str(save_recording(moving, tmp_path / "room")), PAIR, iterations=iterations)
+    with pytest.raises(D2Error, match=f"between: {built}"):
+        Run(settings, tmp_path / "run").prepare()
 
 
 def test_no_motion_leaves_the_temporal_dimension_out() -> None:
