@@ -334,3 +334,13 @@ def test_a_backbone_without_trained_is_checked_through_its_slice() -> None:
     model.gaussians["opacity_logits"].data.fill_(math.nan)
     with pytest.raises(Diverged, match="of opacities is NaN"):
         check.check(4, now=False)
+
+
+def test_without_a_hook_a_run_that_grew_is_continued() -> None:
+    trainer, other = make_trainer(D2Config()), make_trainer(D2Config())
+    trainer.run(20)
+    assert len(trainer.model) != len(other.model)
+    other.load_state_dict(trainer.state_dict())
+    trainer.run()
+    other.run()
+    assert same(parameters(trainer), parameters(other))
