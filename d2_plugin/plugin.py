@@ -250,7 +250,7 @@ class D2Hooks:
             "views": self._sampler.state_dict(),
             "evaluated": self._evaluated,
             "generator": self.generator.get_state(),
-            "inserted_at": self.inserted_at.clone() if self.hooks else torch.zeros(len(self.backbone), dtype=torch.int32),
+            "inserted_at": self.inserted_at.clone() if self.hooks else torch.zeros(len(self.backbone)).int(),
             "idle": dict(self._idle.evaluations),
             "retired": dict(self.retired),
         }

@@ -340,7 +340,7 @@ def test_without_a_hook_a_run_that_grew_is_continued() -> None:
     trainer, other = make_trainer(D2Config()), make_trainer(D2Config())
     trainer.run(20)
     assert len(trainer.model) != len(other.model)
-    other.load_state_dict(trainer.state_dict())
+    other.load_state_dict(copy.deepcopy(trainer.state_dict()))
     trainer.run()
     other.run()
     assert same(parameters(trainer), parameters(other))
