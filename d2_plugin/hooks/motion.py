@@ -45,11 +45,6 @@ class MotionConfig(HookConfig):
     insert: bool = True
     """Whether `densify` also inserts what moves at instants halfway."""
 
-    @classmethod
-    def for_iterations(cls, iterations: int) -> MotionConfig:
-        """Left out of runs below 200 steps: it takes a quarter of their time, in which more steps gain more."""
-        return cls() if iterations >= 200 else cls(stop=1, insert=False)
-
 
 class Motion(Hook):
     """Adds the photometric loss between each view of the present step and the same camera's next instant."""

@@ -110,8 +110,7 @@ class Run:
         with self._writing(), self._timed("priors"):
             points = self._points()
             if self.uses_prior:
-                motion = hook_config(self.settings, self._store).motion
-                between = motion is not None and motion.stop != 1
+                between = hook_config(self.settings, self._store).motion is not None
                 summary = build_priors_for(self.scene, points.positions, self._store, between=between)
                 if on_prior is not None:
                     on_prior(summary)

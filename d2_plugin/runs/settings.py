@@ -30,6 +30,9 @@ from d2_plugin.values import shown
 
 HOOK_NAMES = ("prior", *HOOKS)
 """What `--hooks` may name; "prior" alone builds the depth prior and trains without it."""
+WORTH_MOTION = 200
+"""Shorter runs leave `motion` out unless they have a table of it: in its quarter of their time more steps gain more."""
+
 TABLES = ("backbone", "d2", *HOOKS, "priors", "plan")
 """What a configuration file may hold."""
 
@@ -156,7 +159,10 @@ def prior_settings(settings: RunSettings) -> PriorSettings:
 
 def hook_config(settings: RunSettings, priors: Path) -> D2Config:
     """The hooks of a run with schedules that fit its length, and the user's tables over the defaults."""
-    hooks = tuple(name for name in settings.hooks if name != "prior")
+    left_out = {"prior"}
+    if settings.iterations < WORTH_MOTION and "motion" not in settings.overrides:
+        left_out.add("motion")
+    hooks = tuple(name for name in settings.hooks if name not in left_out)
     d2 = settings.overrides.get("d2", {})
     for name in d2 if isinstance(d2, Mapping) else ():
         if name in HOOKS:

@@ -62,15 +62,19 @@ def test_depth_is_emulated_where_no_network_takes_the_place_of_emulated_maps(mov
     assert not Scene.open(replace(settings, mono_onnx="network.onnx", mono_kind="relative")).plan.emulated
 
 
-@pytest.mark.parametrize(("iterations", "built"), [(199, False), (200, True)])
-def test_flow_is_built_where_the_run_is_long_enough_to_use_it(
-    moving, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, iterations: int, built: bool
+@pytest.mark.parametrize(
+    ("iterations", "tables", "built"), [(199, {}, False), (200, {}, True), (199, {"motion": {}}, True)]
+)
+def test_flow_is_built_where_the_run_is_long_enough_to_use_it_or_its_user_says_so(
+    moving, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, iterations: int, tables: dict, built: bool
 ) -> None:
     def stop(*_: object, between: bool) -> None:
         raise D2Error(f"between: {between}")
 
     monkeypatch.setattr("d2_plugin.runs.run.build_priors_for", stop)
-    settings = RunSettings(str(save_recording(moving, tmp_path / "room")), PAIR, iterations=iterations)
+    settings = RunSettings(
+        str(save_recording(moving, tmp_path / "room")), PAIR, iterations=iterations, overrides=tables
+    )
     with pytest.raises(D2Error, match=f"between: {built}"):
         Run(settings, tmp_path / "run").prepare()
 
