@@ -34,7 +34,6 @@ FLAGS = ("-ffp-contract=off",)
 """The same formula must give the same bits wherever it is inlined; see kernels/simd.h."""
 
 SLOWER = "runs in plain torch: the same images, but orders of magnitude slower and with much more memory."
-
 Pinhole = tuple[Tensor, Tensor, int, int]  # T_camera_world, K, width, height
 
 Pointing = TypeVar("Pointing", bound="PointingFrame")

@@ -33,7 +33,7 @@ from d2_plugin.runs.saved import (
     what_diverged,
 )
 from d2_plugin.runs.scene import Guidance, Scene
-from d2_plugin.runs.settings import HOOK_NAMES, RunSettings, check, hook_config
+from d2_plugin.runs.settings import HOOK_NAMES, RunSettings, check, hook_config, hooks_in_use
 from d2_plugin.runs.start import (
     TimedPoints,
     TrainingFrames,
@@ -110,7 +110,7 @@ class Run:
         with self._writing(), self._timed("priors"):
             points = self._points()
             if self.uses_prior:
-                between = hook_config(self.settings, self._store).motion is not None
+                between = "motion" in hooks_in_use(self.settings)
                 summary = build_priors_for(self.scene, points.positions, self._store, between=between)
                 if on_prior is not None:
                     on_prior(summary)

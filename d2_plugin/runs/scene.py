@@ -14,7 +14,7 @@ from d2_plugin.recordings import Recording, open_recording
 from d2_plugin.recordings.cameras.check import check_background_weight, check_recording
 from d2_plugin.recordings.checks.memory import check_memory
 from d2_plugin.runs.plan import ScenePlan, appearance_decision, plan_scene
-from d2_plugin.runs.settings import RunSettings, prior_settings
+from d2_plugin.runs.settings import RunSettings, hooks_in_use, prior_settings
 from d2_plugin.runs.start import TimedPoints
 
 
@@ -57,9 +57,10 @@ class Scene:
         train, test = _split(recording, settings)
         check_memory(recording, train)
         check_background_weight(recording, train, settings.background_weight)
-        recording = replace(
-            recording, notes=(*recording.notes, *check_recording(recording, (*train, *test), scored=test))
-        )
+        notes = (*recording.notes, *check_recording(recording, (*train, *test), scored=test))
+        if "motion" in {*settings.hooks} - {*hooks_in_use(settings)}:
+            notes += (f"a run of {settings.iterations} steps leaves `motion` out: a table [motion] brings it back",)
+        recording = replace(recording, notes=notes)
         priors, mono = prior_settings(settings), None
         if settings.mono_onnx:
             mono = f"ONNX model {Path(settings.mono_onnx).name}"

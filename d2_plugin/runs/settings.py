@@ -30,9 +30,6 @@ from d2_plugin.values import shown
 
 HOOK_NAMES = ("prior", *HOOKS)
 """What `--hooks` may name; "prior" alone builds the depth prior and trains without it."""
-WORTH_MOTION = 200
-"""Shorter runs leave `motion` out unless they have a table of it: in its quarter of their time more steps gain more."""
-
 TABLES = ("backbone", "d2", *HOOKS, "priors", "plan")
 """What a configuration file may hold."""
 
@@ -157,12 +154,15 @@ def prior_settings(settings: RunSettings) -> PriorSettings:
     return PriorSettings.from_dict(_over(source, settings.overrides.get("priors", {}), "priors"))
 
 
+def hooks_in_use(settings: RunSettings) -> tuple[str, ...]:
+    """Names of the run's hooks. `motion` takes a quarter of the time: in so short a run more steps gain more."""
+    out = {"prior"} if settings.iterations >= 200 or "motion" in settings.overrides else {"prior", "motion"}
+    return tuple(name for name in settings.hooks if name not in out)
+
+
 def hook_config(settings: RunSettings, priors: Path) -> D2Config:
     """The hooks of a run with schedules that fit its length, and the user's tables over the defaults."""
-    left_out = {"prior"}
-    if settings.iterations < WORTH_MOTION and "motion" not in settings.overrides:
-        left_out.add("motion")
-    hooks = tuple(name for name in settings.hooks if name not in left_out)
+    hooks = hooks_in_use(settings)
     d2 = settings.overrides.get("d2", {})
     for name in d2 if isinstance(d2, Mapping) else ():
         if name in HOOKS:

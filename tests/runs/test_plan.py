@@ -75,8 +75,10 @@ def test_flow_is_built_where_the_run_is_long_enough_to_use_it_or_its_user_says_s
     settings = RunSettings(
         str(save_recording(moving, tmp_path / "room")), PAIR, iterations=iterations, overrides=tables
     )
+    run = Run(settings, tmp_path / "run")
+    assert any("brings it back" in note for note in run.scene.recording.notes) == (not built)
     with pytest.raises(D2Error, match=f"between: {built}"):
-        Run(settings, tmp_path / "run").prepare()
+        run.prepare()
 
 
 def test_no_motion_leaves_the_temporal_dimension_out() -> None:
