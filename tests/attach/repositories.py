@@ -38,16 +38,8 @@ from d2_plugin.adapters.successors.swift4d import Swift4DAdapter
 from d2_plugin.protocol import Backbone
 
 MIMICS: dict[str, ModuleType] = {
-    "fudan": fudan,
-    "deformable3d": deformable3d,
-    "hust4d": hust4d,
-    "spacetime": spacetime,
-    "ex4dgs": ex4dgs,
-    "gsplat": gsplat,
-    "fastergs4d": fastergs4d,
-    "gsplat_dynamic": gsplat_dynamic,
-    "swift4d": swift4d,
-    "cem4dgs": cem4dgs,
+    module.__name__.removeprefix("mimics."): module
+    for module in (fudan, deformable3d, hust4d, spacetime, ex4dgs, gsplat, fastergs4d, gsplat_dynamic, swift4d, cem4dgs)
 }
 
 
@@ -157,7 +149,7 @@ def make_deformable3d(is_6dof: bool = False) -> Standing:
     made = inria(deformable3d, model, lambda: Deformable3DAdapter(model, deform, warm_up=0), scene.cameras)
 
     def draw(camera: Any) -> Tensor:
-        motion = deform.step(model.get_xyz, camera.fid.expand(len(model.get_xyz), 1))
+        motion = deform.step(model.get_xyz.detach(), camera.fid.expand(len(model.get_xyz), 1))
         return deformable3d.render(camera, model, [0, 0, 0], *motion, is_6dof)["depth"][0]
 
     return made._replace(draw=draw)

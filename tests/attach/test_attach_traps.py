@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
 import torch
 from mimics import deformable3d, fudan, hust4d, spacetime
-from mimics.inria import cameras_of, default_options
-from mimics.page import attached
+from mimics.inria import Camera, cameras_of, default_options
 from mimics.workplace import HOOKS, some_points
-from repositories import VARIANTS, fudan_model, run
+from repositories import VARIANTS, fudan_model
 from tiny import TinyStore, make_views
 from torch import Tensor
 
@@ -23,19 +23,18 @@ from d2_plugin.adapters.fudan import FudanAdapter
 from d2_plugin.adapters.hust4d import Hust4DAdapter
 from d2_plugin.adapters.keys import PriorKey
 from d2_plugin.adapters.spacetime import SpacetimeAdapter
+from d2_plugin.adapters.successors.fastergs4d import FasterGS4DAdapter
 from d2_plugin.config import DepthLossConfig
-from d2_plugin.protocol import Points, View
+from d2_plugin.protocol import Points
 
 DEPTH_ALONE = D2Config(depth_loss=DepthLossConfig(every=1))
 
 
 class TestFieldsOfView:
     def test_intrinsics_come_from_the_projection_even_off_centre(self) -> None:
-        view = make_views()[0]
-        K = view.K.clone()
+        K = make_views()[0].K.clone()
         K[0, 2], K[1, 2] = 14.5, 13.0
-        camera = cameras_of()[0]
-        moved = type(camera)(View("c", 0, 0.0, view.T_camera_world, K, 32, 24), torch.zeros(24, 32, 3), by_focal=True)
+        moved = Camera(replace(make_views()[0], K=K), torch.zeros(24, 32, 3), FoVx=-1.0, FoVy=-1.0)
         torch.testing.assert_close(intrinsics(moved, 32, 24).float(), K)
 
     def test_a_camera_without_a_projection_is_refused(self) -> None:
@@ -100,13 +99,16 @@ class TestFudan:
 
 
 class TestDeformations:
-    def test_before_the_warm_up_nothing_is_deformed(self) -> None:
+    def test_before_the_warm_up_nothing_is_deformed_and_hooks_may_wait_for_it(self) -> None:
         model, deform, _ = deformable3d.make()
         adapter = Deformable3DAdapter(model, deform, warm_up=30)
         adapter.begin_step(29)
         assert torch.equal(adapter.slice_at(make_views()[0]).means, model._xyz)
+        assert adapter.active(1)
         adapter.begin_step(30)
         assert not torch.equal(adapter.slice_at(make_views()[0]).means, model._xyz)
+        waiting = Deformable3DAdapter(model, deform, warm_up=30, in_warm_up=False)
+        assert [waiting.active(step) for step in (1, 29, 30)] == [False, False, True]
 
     def test_the_length_of_a_quaternion_scales_the_covariance(self) -> None:
         model, deform, _ = deformable3d.make()
@@ -140,12 +142,29 @@ class TestDeformations:
             Hust4DAdapter(model, scene, "medium")
 
 
-def test_another_codebase_than_the_adapters_is_refused() -> None:
-    with pytest.raises(D2Error, match="SimpleNamespace has no densification_postfix, which FudanAdapter needs"):
-        FudanAdapter(SimpleNamespace(_xyz=torch.zeros(3, 3)))
-    model, _ = fudan.make()
-    with pytest.raises(D2Error, match="a camera of type dict has no world_view_transform"):
-        FudanAdapter(model, key=lambda camera: PriorKey("a", 0)).view({})
+@pytest.mark.parametrize(
+    ("adapter", "model", "needed"),
+    [
+        (FudanAdapter, SimpleNamespace(_xyz=torch.zeros(3, 3)), "no densification_postfix, which FudanAdapter"),
+        (FasterGS4DAdapter, SimpleNamespace(_spatial_means=torch.zeros(1, 3)), "no prune, which FasterGS4DAdapter"),
+    ],
+)
+def test_another_codebase_than_the_adapters_is_refused(adapter: type, model: object, needed: str) -> None:
+    with pytest.raises(D2Error, match=f"SimpleNamespace has {needed} needs"):
+        adapter(model)
+
+
+@pytest.mark.parametrize(
+    ("make", "sentence"),
+    [
+        (lambda: FudanAdapter(fudan.make()[0], key=lambda camera: PriorKey("a", 0)), "has no world_view_transform"),
+        (lambda: VARIANTS["gsplat"]().adapter, "is no View"),
+        (lambda: VARIANTS["fastergs4d"]().adapter, "has no perspective `camera`"),
+    ],
+)
+def test_what_is_no_camera_of_the_codebase_is_refused(make: Callable, sentence: str) -> None:
+    with pytest.raises(D2Error, match=f"a camera of type dict {sentence}"):
+        make().view({})
 
 
 def test_points_inside_spacetime_have_its_own_start() -> None:
@@ -182,16 +201,6 @@ def test_without_rotation_in_time_fudan_keeps_the_log_of_a_variance() -> None:
     adapter._append(some_points(1)._replace(lifetimes=torch.tensor([0.02])))
     torch.testing.assert_close(rows[7].exp().sqrt(), torch.tensor([[0.02]]))
     assert rows[8] is None
-
-
-@pytest.mark.usefixtures("workplace")
-def test_hooks_may_wait_for_the_field_of_a_warm_up() -> None:
-    """Until iteration 30 the mimic fits one still scene to all instants, as Deformable-3D-Gaussians until 3000."""
-    source = attached(deformable3d, "deformable3d", "d2.backbone.in_warm_up = False")
-    assert min(entry.step for entry in run("deformable3d", source, stop=36).d2.trace) == 30
-    models = deformable3d.make()[:2]
-    assert Deformable3DAdapter(*models, warm_up=30).active(1)
-    assert not Deformable3DAdapter(*models, warm_up=30, in_warm_up=False).active(29)
 
 
 def test_attaching_again_takes_the_place_of_the_first() -> None:

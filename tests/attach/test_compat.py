@@ -30,6 +30,7 @@ class TestThreeDGS:
         expected = rasterize(scene.splats, scene.colors, scene.view, background=camera["bg"].double())
         torch.testing.assert_close(color, expected.color.permute(2, 0, 1), atol=1e-6, rtol=1e-6)
         assert radii.dtype == torch.int32
+        assert color.is_contiguous(), "trainers call `.view(-1)`"
 
     def test_camera_is_recovered_from_the_two_matrices(self) -> None:
         turn = torch.linalg.qr(torch.randn(3, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1)))[0]

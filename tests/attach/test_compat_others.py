@@ -13,7 +13,7 @@ from mimics.inria import Camera
 from rasterizer_arguments import inria_camera
 from splat_scenes import random_scene
 
-from d2_plugin.compat import depth, ex4dgs, kinematic, nearest, spacetime, vision
+from d2_plugin.compat import ex4dgs, kinematic, nearest, spacetime, vision
 from d2_plugin.compat.nearest import knn
 from d2_plugin.compat.python_config import Config
 from d2_plugin.gaussians.rotation4d import rotation_matrices_3d
@@ -29,15 +29,6 @@ def scene():
 @pytest.fixture
 def camera(scene) -> dict:
     return inria_camera(scene.view)
-
-
-def test_images_are_contiguous(camera: dict, scene) -> None:
-    """A permuted one breaks `.view(-1)`, which trainers call."""
-    raster = depth.GaussianRasterizer(depth.GaussianRasterizationSettings(**camera))
-    given = {"means3D": scene.means, "opacities": scene.opacities[:, None], "means2D": torch.zeros(40, 3)}
-    color = raster(**given, colors_precomp=scene.colors, cov3D_precomp=scene.covariances)[0]
-    assert color.is_contiguous()
-    assert color.view(-1).shape == (3 * 24 * 16,)
 
 
 class TestSpacetime:

@@ -99,15 +99,13 @@ def checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
         path.write_text(text)
     monkeypatch.syspath_prepend(str(tmp_path))
     tops = {"gsplat", "torchmetrics", "datasets", "simple_trainer"}
-    kept = {name: module for name, module in sys.modules.items() if name.split(".")[0] in tops}
-    for name in kept:
-        del sys.modules[name]
+    for name in [name for name in sys.modules if name.split(".")[0] in tops]:
+        monkeypatch.delitem(sys.modules, name)
     importlib.invalidate_caches()
     sys.modules["gsplat.csrc"] = stand_in
     yield tmp_path
     for name in [name for name in sys.modules if name.split(".")[0] in tops]:
         del sys.modules[name]
-    sys.modules.update(kept)
 
 
 def trained(config: D2Config | None) -> tuple[dict[str, torch.Tensor], GsplatSession | None]:
@@ -144,8 +142,6 @@ def test_hooks_insert_remove_and_pull_on_depth() -> None:
     assert log.inserted > 0
     assert len(attached["means"]) == len(session.hooks.backbone)
     assert {entry.hook for entry in session.hooks.trace} == {"densify", "prune", "depth_loss"}
-    assert session.objects.options.max_steps == 40
-    assert session._iteration == 40
 
 
 @pytest.mark.usefixtures("checkout")
@@ -204,11 +200,8 @@ class TestRasterization:
         scales = 0.02 + 0.2 * torch.rand(40, 3, generator=generator)
         view = scene.view
         named = {"means": scene.means.float(), "quats": quats, "scales": scales, "opacities": scene.opacities.float()}
-        named |= {
-            "viewmats": view.T_camera_world.float()[None],
-            "Ks": view.K.float()[None],
-            "colors": scene.colors.float(),
-        }
+        named |= {"viewmats": view.T_camera_world.float()[None], "Ks": view.K.float()[None]}
+        named["colors"] = scene.colors.float()
         return named | {"width": view.width, "height": view.height, "near_plane": 0.01}, view
 
     def test_it_draws_what_the_reference_draws(self, given: tuple[dict, object]) -> None:
@@ -240,11 +233,9 @@ class TestRasterization:
         assert dense["means2d"].grad.abs().max() > 0
         torch.testing.assert_close(dense["means2d"].grad[0, sparse["gaussian_ids"]], sparse["means2d"].grad)
         assert torch.equal(dense["radii"][0, sparse["gaussian_ids"]], sparse["radii"])
-        moved = named | {"means": named["means"] + 0.0}
-        image, _, meta = stand_in.rasterization(**moved, packed=False)
         homogeneous = torch.cat([named["means"], torch.ones(40, 1)], 1) @ view.T_camera_world.float().T
         pixels = (homogeneous[:, :3] @ view.K.float().T)[:, :2] / homogeneous[:, 2:3]
-        torch.testing.assert_close(meta["means2d"][0].detach(), pixels, atol=1e-3, rtol=1e-4)
+        torch.testing.assert_close(dense["means2d"][0].detach(), pixels, atol=1e-3, rtol=1e-4)
 
     def test_what_needs_its_kernels_is_refused_by_name(self, given: tuple[dict, object]) -> None:
         with pytest.raises(D2Error, match="absgrad of gsplat's rasterization needs its own kernels"):

@@ -1,30 +1,20 @@
-"""FasterGS4D, gsplat's contrib.dynamic, Swift4D and CEM-4DGS: what is particular to each."""
+"""gsplat's contrib.dynamic, Swift4D and CEM-4DGS: what is particular to each."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from types import SimpleNamespace
 
 import pytest
 import torch
 from mimics import gsplat_dynamic
 from mimics.workplace import some_points
-from repositories import clone, make_cem4dgs, make_fastergs4d, make_gsplat_dynamic, make_swift4d
+from repositories import clone, make_cem4dgs, make_gsplat_dynamic, make_swift4d
 from torch import Tensor
 
 from d2_plugin import D2Error
-from d2_plugin.adapters.successors.fastergs4d import FasterGS4DAdapter
 from d2_plugin.adapters.successors.gsplat_dynamic import GsplatDynamicAdapter
 from d2_plugin.protocol import Points
-
-
-class TestFasterGS4D:
-    def test_another_object_or_camera_is_refused(self) -> None:
-        with pytest.raises(D2Error, match="SimpleNamespace has no prune, which FasterGS4DAdapter needs"):
-            FasterGS4DAdapter(SimpleNamespace(_spatial_means=torch.zeros(1, 3)))
-        with pytest.raises(D2Error, match="a camera of type dict has no perspective `camera`"):
-            make_fastergs4d().adapter.view({})
 
 
 @pytest.mark.parametrize(

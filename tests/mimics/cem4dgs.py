@@ -76,11 +76,7 @@ class GaussianModel(ex4dgs.GaussianModel):
         keep = torch.cat([~static_mask, ~dynamic_mask])
         renumbered = torch.cat([torch.cumsum(keep, 0) - 1, torch.tensor([-1])])  # the last for parents of -1
         self._parent, self._level = renumbered[self._parent[keep]], self._level[keep]
-        for group, moments in self._each_column():
-            rows = ~(dynamic_mask if group["name"].startswith("motion_") else static_mask)
-            self._swap(group, group["params"][0][rows], {key: value[rows] for key, value in moments.items()})
-        for name in (*self.accumulated, *self.kept, "max_radii2D"):
-            setattr(self, name, getattr(self, name)[~static_mask])
+        self._keep(~static_mask, ~dynamic_mask)
 
     def densify_and_clone(self, grads: Tensor, threshold: float, extent: float) -> None:
         """The errors, parents and levels are lengthened by the caller, splats before motions."""
@@ -114,10 +110,6 @@ class GaussianModel(ex4dgs.GaussianModel):
         self._level = torch.cat([self._level, torch.zeros(len(moving), 1, dtype=torch.long)])
         self._xyz.data[moving] = 0.0
         self._xyz_disp.data[moving] = 0.0
-
-    def prune_nan_points(self) -> None:
-        if self._xyz.isnan().any():
-            self.prune_points(self._xyz.isnan().any(1))
 
 
 def make() -> tuple[GaussianModel, Scene]:

@@ -7,18 +7,8 @@ from types import SimpleNamespace
 import torch
 from torch import Tensor, nn
 
-from .inria import (
-    InriaModel,
-    Scene,
-    cameras_of,
-    default_options,
-    densify,
-    draw_all,
-    l1_loss,
-    restore,
-    shuffled,
-    started,
-)
+from . import inria
+from .inria import InriaModel, cameras_of, default_options, densify, draw_all, l1_loss, restore, shuffled, started
 
 GaussianModel = InriaModel
 
@@ -73,13 +63,13 @@ def render(viewpoint_camera, pc, bg_color, d_xyz, d_rotation, d_scaling, is_6dof
     return package | {"viewspace_points_densify": package["viewspace_points"]}
 
 
-def make(is_6dof: bool = False) -> tuple[GaussianModel, DeformModel, Scene]:
+def make(is_6dof: bool = False) -> tuple[GaussianModel, DeformModel, inria.Scene]:
     cameras = cameras_of(fid=lambda view: torch.tensor([view.time]))
-    return started(GaussianModel()), DeformModel(is_6dof=is_6dof), Scene(cameras)
+    return started(GaussianModel()), DeformModel(is_6dof=is_6dof), inria.Scene(cameras)
 
 
 def training(
-    gaussians: GaussianModel, deform: DeformModel, scene: Scene, opt=None, checkpoint=None, stop: int = 10**9
+    gaussians: GaussianModel, deform: DeformModel, scene: inria.Scene, opt=None, checkpoint=None, stop: int = 10**9
 ) -> SimpleNamespace:
     """The repository saves no optimizer, so `checkpoint` is what one would add to resume at all."""
     opt, dataset, first_iter = opt or default_options(), SimpleNamespace(white_background=False), 0

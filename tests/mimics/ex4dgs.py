@@ -10,18 +10,7 @@ from torch import Tensor, nn
 from d2_plugin.rasterizer import RasterSettings, Splats
 
 from . import inria
-from .inria import (
-    Camera,
-    InriaModel,
-    cameras_of,
-    covariances,
-    default_options,
-    densify,
-    draw,
-    l1_loss,
-    shuffled,
-    started,
-)
+from .inria import InriaModel, cameras_of, covariances, default_options, densify, draw, l1_loss, shuffled, started
 
 STATIC = (*InriaModel.columns, ("xyz_disp", "_xyz_disp"))
 DYNAMIC = (
@@ -72,17 +61,21 @@ class GaussianModel(InriaModel):
 
     @property
     def rgb(self) -> Tensor:
-        dc, rest = (torch.cat([getattr(self, a), getattr(self, f"{a}_motion")]) for a in _FEATURES)
+        dc = torch.cat([self._features_dc, self._features_dc_motion])
+        rest = torch.cat([self._features_rest, self._features_rest_motion])
         return (0.5 + 0.282 * dc[:, 0] + 0 * rest.sum((1, 2))[:, None]).clamp_min(0)
 
     def prune_points(self, static_mask: Tensor, dynamic_mask: Tensor) -> None:
         if dynamic_mask.shape[0] == 0:
             dynamic_mask = torch.empty(0, dtype=torch.bool)
-        for group, moments in self._each_column():
-            keep = ~(dynamic_mask if group["name"].startswith("motion_") else static_mask)
-            self._swap(group, group["params"][0][keep], {key: value[keep] for key, value in moments.items()})
+        self._keep(~static_mask, ~dynamic_mask)
+
+    def _keep(self, static: Tensor, dynamic: Tensor) -> None:
+        for name, _ in self.columns:
+            keep = dynamic if name.startswith("motion_") else static
+            self._change(name, lambda rows: rows[keep], lambda rows: rows[keep])  # noqa: B023
         for name in (*self.accumulated, *self.kept, "max_radii2D"):
-            setattr(self, name, getattr(self, name)[~static_mask])
+            setattr(self, name, getattr(self, name)[static])
 
     def _added(self, columns: tuple[tuple[str, str], ...], values: tuple[Tensor, ...]) -> None:
         assert len(values) == len(columns)
@@ -139,18 +132,13 @@ class GaussianModel(InriaModel):
         self.xyz_error_min[better], self.xyz_error_min_timestamp[better] = loss, float(timestamp)
 
     def prune_nan_points(self) -> None:
-        masks = [values.isnan().flatten(1).any(1) for values in (self._xyz, self._xyz_motion)]
-        if any(mask.any() for mask in masks):
-            self.prune_points(*masks)
-
-
-_FEATURES = ("_features_dc", "_features_rest")
+        """There are none here."""
 
 
 class Scene(inria.Scene):
     """Cameras of its N3V reader (dataset_readers.py:291): `image_name` is the FRAME's file, the camera is a folder."""
 
-    def __init__(self, cameras: list[Camera]) -> None:
+    def __init__(self, cameras: list[inria.Camera]) -> None:
         for camera in cameras:
             name, frame = camera.image_name.split("_")
             camera.image_name = f"{int(frame)}.png"
@@ -158,7 +146,7 @@ class Scene(inria.Scene):
         super().__init__(cameras)
 
 
-def opacity_compensation(means: Tensor, cov: Tensor, camera: Camera, kernel: float) -> Tensor:
+def opacity_compensation(means: Tensor, cov: Tensor, camera: inria.Camera, kernel: float) -> Tensor:
     """By automatic differentiation of the projection, guards as in the rasterizer."""
     view = camera.drawn_view()
     R, t = view.T_camera_world[:3, :3], view.T_camera_world[:3, 3]
@@ -197,11 +185,8 @@ def make() -> tuple[GaussianModel, Scene]:
 
 def training(gaussians: GaussianModel, scene: Scene, opt=None, checkpoint=None, stop: int = 10**9) -> SimpleNamespace:
     opt = opt or default_options()
-    dataset, first_iter = SimpleNamespace(white_background=False, near=0.2, far=100.0), 0
-    gaussians.training_setup(opt)
-    if checkpoint:
-        (model_params, first_iter) = checkpoint
-        gaussians.restore(model_params, opt)
+    dataset = SimpleNamespace(white_background=False, near=0.2, far=100.0)
+    first_iter = inria.set_up(gaussians, opt, checkpoint)
 
     bg_color = [1, 1, 1] if dataset.white_background else [0, 0, 0]
     for iteration in range(first_iter + 1, min(opt.iterations, stop) + 1):

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from d2_plugin.protocol import View
 from d2_plugin.rasterizer import RasterSettings, Splats, rasterize
 
-from .inria import SH_C0, initial_points, l1_loss, restore, shuffled
+from .inria import SH_C0, Change, initial_points, l1_loss, restore, shuffled, swap
 
 RATES = {
     "spatial_means": 2e-3, "temporal_means": 2e-3, "sh_coefficients_0": 2e-2, "sh_coefficients_rest": 1e-3,
@@ -73,24 +73,15 @@ class Gaussians(nn.Module):
     def reset_densification_info(self) -> None:
         self._densification_info = torch.zeros(2, len(self._spatial_means))
 
-    def _swap(self, change, moment_change) -> None:
+    def _change(self, value: Change, moments: Change) -> None:
         for group in self.optimizer.param_groups:
-            old = group["params"][0]
-            state = self.optimizer.state.pop(old, {})
-            new = nn.Parameter(change(group["name"], old.detach()))
-            for key in ("exp_avg", "exp_avg_sq"):
-                if key in state:
-                    state[key] = moment_change(group["name"], state[key])
-            if state:
-                self.optimizer.state[new] = state
-            group["params"][0] = new
-            setattr(self, f"_{group['name']}", new)
+            setattr(self, f"_{group['name']}", swap(self.optimizer, group, value, moments))
 
     def prune(self, prune_mask: Tensor) -> None:
         self._keep(~prune_mask)
 
     def _keep(self, rows: Tensor) -> None:
-        self._swap(lambda _, p: p[rows], lambda _, m: m[rows])
+        self._change(lambda p: p[rows], lambda m: m[rows])
         if self._densification_info is not None:
             self._densification_info = self._densification_info[:, rows].contiguous()
 
@@ -101,9 +92,7 @@ class Gaussians(nn.Module):
         """Copies of small Gaussians at the end, then one prune of what is faint."""
         info = self._densification_info
         chosen = info[1] >= grad_threshold * info[0].clamp_min(1.0)
-        self._swap(
-            lambda _, p: torch.cat([p, p[chosen]]), lambda _, m: torch.cat([m, torch.zeros_like(m[chosen])])
-        )
+        self._change(lambda p: torch.cat([p, p[chosen]]), lambda m: torch.cat([m, torch.zeros_like(m[chosen])]))
         self._densification_info = None
         self.prune(self._opacities.flatten() < math.log(min_opacity / (1 - min_opacity)))
 
@@ -175,7 +164,6 @@ class Trainer:
             self.model.gaussians.training_setup()
         self.model.gaussians.reset_densification_info()
 
-
     def training_iteration(self, iteration: int) -> None:
         order = shuffled(len(self.dataset), iteration + 1)
         new_densification_info = torch.zeros_like(self.model.gaussians._densification_info)
@@ -201,7 +189,7 @@ class Trainer:
         if 10 < iteration < 80 and iteration % 13 == 0:
             gaussians.adaptive_density_control(3e-3, 0.005)
             gaussians.reset_densification_info()
-        if iteration and iteration % 20 == 0:
+        if iteration and iteration % 15 == 0:
             gaussians.apply_morton_ordering()
 
 

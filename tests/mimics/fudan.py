@@ -10,7 +10,7 @@ from torch import Tensor
 
 from d2_plugin.gaussians.slicing import slice_gaussians
 
-from .inria import Camera, InriaModel, cameras_of, default_options, densify, draw, l1_loss, shuffled, started
+from .inria import Camera, InriaModel, cameras_of, default_options, densify, draw, l1_loss, set_up, shuffled, started
 
 
 class GaussianModel(InriaModel):
@@ -58,11 +58,7 @@ def make() -> tuple[GaussianModel, Scene]:
 
 def training(gaussians: GaussianModel, scene: Scene, opt=None, checkpoint=None, stop: int = 10**9) -> SimpleNamespace:
     opt, dataset = opt or default_options(), SimpleNamespace(white_background=False)
-    batch_size, first_iter = opt.batch_size, 0
-    gaussians.training_setup(opt)
-    if checkpoint:
-        (model_params, first_iter) = checkpoint
-        gaussians.restore(model_params, opt)
+    batch_size, first_iter = opt.batch_size, set_up(gaussians, opt, checkpoint)
     bg_color = [1, 1, 1] if dataset.white_background else [0, 0, 0]
     training_dataset = scene.getTrainCameras()
     for iteration in range(first_iter + 1, min(opt.iterations, stop) + 1):

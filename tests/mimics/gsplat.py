@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from types import SimpleNamespace
 
 import torch
@@ -11,7 +12,7 @@ from torch import Tensor, nn
 
 from d2_plugin.rasterizer import Splats, rasterize
 
-from .inria import SH_C0, covariances, initial_points, l1_loss, shuffled
+from .inria import SH_C0, covariances, initial_points, l1_loss, shuffled, swap
 
 RATES = {"means": 2e-3, "scales": 1e-2, "quats": 2e-3, "opacities": 5e-2, "sh0": 2e-2, "shN": 1e-3}
 
@@ -36,16 +37,9 @@ def make() -> tuple[nn.ParameterDict, dict[str, torch.optim.Adam], DefaultStrate
 
 def change(splats, optimizers, state, parameter_fn, moment_fn, state_fn) -> None:
     """Every parameter, its moments, and every statistic of the strategy."""
-    for name in list(splats):
-        old, optimizer = splats[name], optimizers[name]
-        moments = optimizer.state.pop(old, {})
-        new = nn.Parameter(parameter_fn(name, old.detach()))
-        for key in moments:
-            if key != "step":
-                moments[key] = moment_fn(moments[key])
-        optimizer.param_groups[0]["params"] = [new]
-        optimizer.state[new] = moments
-        splats[name] = new
+    for name, optimizer in optimizers.items():
+        changed = partial(parameter_fn, name)
+        splats[name] = swap(optimizer, optimizer.param_groups[0], changed, moment_fn)
     for key, value in state.items():
         if isinstance(value, Tensor):
             state[key] = state_fn(value)

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from . import inria
-from .inria import Camera, InriaModel, cameras_of, default_options, densify, draw_all, l1_loss, shuffled, started
+from .inria import InriaModel, cameras_of, default_options, densify, draw_all, l1_loss, set_up, shuffled, started
 
 
 class DeformNetwork(nn.Module):
@@ -50,6 +50,12 @@ class GaussianModel(InriaModel):
         super().create_from_pcd(points, colors, scale)
         self._deformation_table = torch.ones(len(points), dtype=torch.bool)
 
+    def deformed(self, time: float) -> tuple[Tensor, ...]:
+        """Raw positions, scales, rotations and opacities at a time."""
+        shs = torch.cat([self._features_dc, self._features_rest], 1)
+        times = torch.tensor(time).repeat(self._xyz.shape[0], 1)
+        return self._deformation(self._xyz, self._scaling, self._rotation, self._opacity, shs, times)[:4]
+
     def _zero_accumulators(self) -> None:
         super()._zero_accumulators()
         self._deformation_accum = torch.zeros(len(self._xyz), 3)
@@ -78,7 +84,7 @@ class GaussianModel(InriaModel):
 class Scene(inria.Scene):
     """Cameras that only know their place in the data set; the paths are with the data set."""
 
-    def __init__(self, cameras: list[Camera]) -> None:
+    def __init__(self, cameras: list[inria.Camera]) -> None:
         paths = [f"/data/scene/{name[:4]}/images/{name[5:]}.png" for name in (c.image_name for c in cameras)]
         for index, camera in enumerate(cameras):
             camera.image_name, camera.uid = f"{index}", index
@@ -87,11 +93,8 @@ class Scene(inria.Scene):
 
 def render(viewpoint_camera, pc, bg_color, stage="fine") -> dict[str, Tensor]:
     """Depth without alpha, as in the repository."""
-    means, scales, rotations, opacity = pc._xyz, pc._scaling, pc._rotation, pc._opacity
-    if stage == "fine":
-        time = torch.tensor(viewpoint_camera.time).repeat(means.shape[0], 1)
-        shs = torch.cat([pc._features_dc, pc._features_rest], 1)
-        means, scales, rotations, opacity, _ = pc._deformation(means, scales, rotations, opacity, shs, time)
+    still = pc._xyz, pc._scaling, pc._rotation, pc._opacity
+    means, scales, rotations, opacity = pc.deformed(viewpoint_camera.time) if stage == "fine" else still
     rotations = nn.functional.normalize(rotations)
     return draw_all(pc, viewpoint_camera, bg_color, means, scales.exp(), rotations, torch.sigmoid(opacity))
 
@@ -103,16 +106,12 @@ def make() -> tuple[GaussianModel, Scene]:
 def training(gaussians: GaussianModel, scene: Scene, opt=None, checkpoint=None, stop: int = 10**9) -> SimpleNamespace:
     opt = opt or default_options()
     if checkpoint is None:
-        scene_reconstruction(gaussians, scene, "coarse", opt, None, min(20, stop), 20)
+        scene_reconstruction(gaussians, scene, "coarse", opt, None, stop, 5)
     return scene_reconstruction(gaussians, scene, "fine", opt, checkpoint, stop, opt.iterations)
 
 
 def scene_reconstruction(gaussians, scene, stage, opt, checkpoint, stop, train_iter) -> SimpleNamespace:
-    dataset, first_iter = SimpleNamespace(white_background=False), 0
-    gaussians.training_setup(opt)
-    if checkpoint:
-        (model_params, first_iter) = checkpoint
-        gaussians.restore(model_params, opt)
+    dataset, first_iter = SimpleNamespace(white_background=False), set_up(gaussians, opt, checkpoint)
 
     bg_color = [1, 1, 1] if dataset.white_background else [0, 0, 0]
     for iteration in range(first_iter + 1, min(train_iter, stop) + 1):
@@ -132,4 +131,7 @@ def scene_reconstruction(gaussians, scene, stage, opt, checkpoint, stop, train_i
             if iteration < opt.iterations:
                 gaussians.optimizer.step()
                 gaussians.optimizer.zero_grad(set_to_none = True)
+                if hasattr(gaussians, "hash_optimizer"):
+                    gaussians.hash_optimizer.step()
+                    gaussians.hash_optimizer.zero_grad(set_to_none = True)
     return SimpleNamespace(**locals())

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from types import SimpleNamespace
 from typing import ClassVar
 
@@ -21,14 +21,12 @@ INRIA = RasterSettings()
 
 
 class Camera:
-    """Matrices transposed as in Inria's, intrinsics by fields of view or, where those are -1, by focal lengths."""
+    """Matrices transposed as in Inria's, intrinsics by fields of view."""
 
-    def __init__(self, view: View, image: Tensor, *, by_focal: bool = False, **extra: object) -> None:
+    def __init__(self, view: View, image: Tensor, **extra: object) -> None:
         fx, fy, cx, cy = (float(view.K[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2)))
         self.image_width, self.image_height = view.width, view.height
-        self.FoVx = -1.0 if by_focal else 2 * math.atan(view.width / (2 * fx))
-        self.FoVy = -1.0 if by_focal else 2 * math.atan(view.height / (2 * fy))
-        self.fl_x, self.fl_y, self.cx, self.cy = (fx, fy, cx, cy) if by_focal else (-1, -1, -1, -1)
+        self.FoVx, self.FoVy = 2 * math.atan(view.width / (2 * fx)), 2 * math.atan(view.height / (2 * fy))
         projection = torch.zeros(4, 4)
         projection[0, 0], projection[1, 1] = 2 * fx / view.width, 2 * fy / view.height
         projection[0, 2], projection[1, 2] = 2 * cx / view.width - 1, 2 * cy / view.height - 1
@@ -67,7 +65,7 @@ def default_options(**changed: object) -> SimpleNamespace:
     options = {
         "iterations": 100, "percent_dense": 0.01, "position_lr_init": 2e-3, "densify_from_iter": 10,
         "densify_until_iter": 80, "densification_interval": 13, "densify_grad_threshold": 3e-3, "batch_size": 2,
-        "warm_up": 30,
+        "warm_up": 8,
     }  # fmt: skip
     return SimpleNamespace(**(options | changed))
 
@@ -126,6 +124,20 @@ def draw_all(pc: InriaModel, camera: Camera, bg_color: list[int], means, scales,
 
 def l1_loss(image: Tensor, truth: Tensor) -> Tensor:
     return (image - truth).abs().mean()
+
+
+Change = Callable[[Tensor], Tensor]
+
+
+def swap(optimizer: torch.optim.Adam, group: dict, value: Change, moments: Change) -> nn.Parameter:
+    """Put another parameter in a group's place, with what becomes of its values and its moments."""
+    old = group["params"][0]
+    state = optimizer.state.pop(old, {})
+    group["params"][0] = nn.Parameter(value(old.detach()))
+    if state:
+        changed = {key: moments(state[key]) for key in ("exp_avg", "exp_avg_sq")}
+        optimizer.state[group["params"][0]] = state | changed
+    return group["params"][0]
 
 
 class InriaModel:
@@ -195,33 +207,22 @@ class InriaModel:
         for name in self.accumulated:
             setattr(self, name, torch.zeros(len(self._xyz), 1))
 
-    def _swap(self, group: dict, value: Tensor, moments: Mapping[str, Tensor]) -> None:
-        stored = self.optimizer.state.pop(group["params"][0], None)
-        group["params"][0] = nn.Parameter(value.requires_grad_(True))
-        if stored is not None:
-            self.optimizer.state[group["params"][0]] = stored | moments
-        setattr(self, dict(self.columns)[group["name"]], group["params"][0])
-
-    def _each_column(self):
-        names = dict(self.columns)
-        for group in self.optimizer.param_groups:
-            if group["name"] in names:
-                state = self.optimizer.state.get(group["params"][0], {})
-                yield group, {key: state[key] for key in ("exp_avg", "exp_avg_sq") if key in state}
+    def _change(self, name: str, value: Change, moments: Change) -> None:
+        """What becomes of a column, and of its moments."""
+        group = next(group for group in self.optimizer.param_groups if group["name"] == name)
+        setattr(self, dict(self.columns)[name], swap(self.optimizer, group, value, moments))
 
     def prune_points(self, mask: Tensor) -> None:
         keep = ~mask
-        for group, moments in self._each_column():
-            self._swap(group, group["params"][0][keep], {key: value[keep] for key, value in moments.items()})
+        for name, _ in self.columns:
+            self._change(name, lambda rows: rows[keep], lambda rows: rows[keep])
         for name in (*self.accumulated, "max_radii2D"):
             setattr(self, name, getattr(self, name)[keep])
 
     def cat_tensors_to_optimizer(self, new: Mapping[str, Tensor]) -> None:
-        for group, moments in self._each_column():
-            if group["name"] in new:
-                rows = new[group["name"]]
-                padded = {key: torch.cat([value, torch.zeros_like(rows)]) for key, value in moments.items()}
-                self._swap(group, torch.cat([group["params"][0], rows]), padded)
+        for name, rows in new.items():
+            zeros = torch.zeros_like(rows)
+            self._change(name, lambda old: torch.cat([old, rows]), lambda old: torch.cat([old, zeros]))  # noqa: B023
 
     def densification_postfix(self, *values: Tensor) -> None:
         """Raw rows in the order of `columns`; erases the evidence of every Gaussian, as all these repositories do."""
@@ -289,6 +290,14 @@ def kept(model: object) -> dict[str, object]:
 def restore(model: object, saved: Mapping[str, object]) -> None:
     for name, value in copy.deepcopy(saved).items():
         setattr(model, name, value)
+
+
+def set_up(gaussians: InriaModel, opt: SimpleNamespace, checkpoint: tuple[Mapping, int] | None) -> int:
+    """Prepare for training, go on from a checkpoint where there is one; returns the iteration that it was made at."""
+    gaussians.training_setup(opt)
+    model_params, first_iter = checkpoint or ({}, 0)
+    gaussians.restore(model_params, opt)
+    return first_iter
 
 
 def densify(gaussians, opt, iteration: int, gradient: Tensor, seen: Tensor, radii: Tensor, faint=0.005) -> None:

@@ -24,9 +24,9 @@ def added_lines(page: str) -> list[tuple[str, str, str]]:
     return found
 
 
-def attached(mimic: ModuleType, page: str, *after_first: str) -> ModuleType:
-    """The mimic with the page's lines in its `training`; `after_first` is code to run after line 1."""
-    mimic = sys.modules[mimic.training.__module__]  # cem4dgs is trained by Ex4DGS's loop
+def attached(mimic: ModuleType, page: str) -> ModuleType:
+    """The mimic with the page's lines in its `training`, which may be another mimic's."""
+    mimic = sys.modules[mimic.training.__module__]
     lines = inspect.getsource(mimic).splitlines()
     for before, added, after in added_lines(page):
         if re.match(r"(from|import) ", added):
@@ -35,7 +35,7 @@ def attached(mimic: ModuleType, page: str, *after_first: str) -> ModuleType:
         at = _place(lines, before, after)
         indent = re.match(r" *", lines[at])[0]
         at += lines[at].strip() == before
-        lines[at:at] = [indent + line for line in (added, *(after_first if added.startswith("d2 = ") else ()))]
+        lines.insert(at, indent + added)
     module = ModuleType(f"{mimic.__name__}_attached")
     module.__package__ = mimic.__package__
     sys.modules[module.__name__] = module

@@ -1,4 +1,4 @@
-"""After WuJH2001/swift4d: 4DGaussians with a logit per Gaussian that says whether a hash grid deforms it."""
+"""After WuJH2001/swift4d: 4DGaussians, its loop too, with a logit per Gaussian: whether a hash grid deforms it."""
 
 from __future__ import annotations
 
@@ -7,8 +7,10 @@ from types import SimpleNamespace
 import torch
 from torch import Tensor, nn
 
-from .hust4d import Scene
-from .inria import InriaModel, cameras_of, default_options, densify, draw_all, l1_loss, shuffled, started
+from .hust4d import Scene, render, training
+from .inria import InriaModel, cameras_of, started
+
+__all__ = ["make", "render", "training"]
 
 
 class SpaceTimeHashingField(nn.Module):
@@ -46,7 +48,7 @@ class GaussianModel(InriaModel):
     def get_xyz_bound(self) -> tuple[Tensor, Tensor]:
         return self._xyz.detach().amin(0), self._xyz.detach().amax(0)
 
-    def training_setup(self, training_args: SimpleNamespace, args: object = None) -> None:
+    def training_setup(self, training_args: SimpleNamespace) -> None:
         super().training_setup(training_args)
         self._FDhash = SpaceTimeHashingField(*self.get_xyz_bound())
         self.hash_optimizer = torch.optim.Adam(self._FDhash.get_params(), lr=1e-3)
@@ -72,69 +74,30 @@ class GaussianModel(InriaModel):
         super().prune_points(mask)
         self._max_weight = self._max_weight[~mask]
 
+    def deformed(self, time: float) -> tuple[Tensor, ...]:
+        """Rows that do not move are put back beside those that the field returned."""
+        dyn_mask = (self._dynamic > self.dynamic_thro).squeeze(1)
+        raw = self._xyz, self._scaling, self._rotation, self._opacity
+        shs = torch.cat([self._features_dc, self._features_rest], 1)[dyn_mask]
+        times = torch.tensor(time).repeat(int(dyn_mask.sum()), 1)
+        moved = self._FDhash(*(part[dyn_mask] for part in raw), shs, times)[:4]
+        final = tuple(torch.zeros_like(part) for part in raw)
+        for part, now, whole in zip(raw, moved, final):
+            whole[dyn_mask], whole[~dyn_mask] = now, part[~dyn_mask]
+        return final
+
+    def add_densification_stats(self, gradient: Tensor, update_filter: Tensor) -> None:
+        super().add_densification_stats(gradient, update_filter)
+        self._max_weight = torch.max(self._max_weight, update_filter.float())
+
+    def densify_and_prune(self, max_grad: float, min_opacity: float, extent: float, max_screen_size: object) -> None:
+        super().densify_and_prune(max_grad, min_opacity, extent, max_screen_size)
+        self.weight_prune(0.02)
+
     def weight_prune(self, weight_threshold: float) -> None:
         self.prune_points(self._max_weight < weight_threshold)
         self._max_weight = self._max_weight * 0.0
 
 
-def render(viewpoint_camera, pc, bg_color, stage="fine") -> dict[str, Tensor]:
-    """Depth without alpha; rows that do not move are put back beside those that the field returned."""
-    means, scales, rotations, opacity = pc._xyz, pc._scaling, pc._rotation, pc._opacity
-    if stage == "fine":
-        dyn_mask = (pc._dynamic > pc.dynamic_thro).squeeze(1)
-        time = torch.tensor(viewpoint_camera.time).repeat(int(dyn_mask.sum()), 1)
-        raw = (means, scales, rotations, opacity)
-        shs = torch.cat([pc._features_dc, pc._features_rest], 1)[dyn_mask]
-        moved = pc._FDhash(*(part[dyn_mask] for part in raw), shs, time)[:4]
-        final = [torch.zeros_like(part) for part in raw]
-        for part, now, whole in zip(raw, moved, final):
-            whole[dyn_mask], whole[~dyn_mask] = now, part[~dyn_mask]
-        means, scales, rotations, opacity = final
-    rotations = nn.functional.normalize(rotations)
-    package = draw_all(pc, viewpoint_camera, bg_color, means, scales.exp(), rotations, torch.sigmoid(opacity))
-    return package | {"max_weight_t": package["visibility_filter"].float()}
-
-
 def make() -> tuple[GaussianModel, Scene]:
     return started(GaussianModel()), Scene(cameras_of(time=lambda view: view.time))
-
-
-def training(gaussians: GaussianModel, scene: Scene, opt=None, checkpoint=None, stop: int = 10**9) -> SimpleNamespace:
-    opt = opt or default_options()
-    if checkpoint is None:
-        scene_reconstruction(gaussians, scene, "coarse", opt, None, min(20, stop))
-    return scene_reconstruction(gaussians, scene, "fine", opt, checkpoint, stop)
-
-
-def scene_reconstruction(gaussians, scene, stage, opt, checkpoint, stop, args=None) -> SimpleNamespace:
-    dataset, first_iter, train_iter = SimpleNamespace(white_background=False), 0, opt.iterations
-    gaussians.training_setup(opt, args)
-    if checkpoint:
-        (model_params, first_iter) = checkpoint
-        gaussians.restore(model_params, opt)
-
-    bg_color = [1, 1, 1] if dataset.white_background else [0, 0, 0]
-    for iteration in range(first_iter + 1, min(train_iter, stop) + 1):
-        torch.manual_seed(iteration)
-        stack = scene.getTrainCameras()
-        viewpoint_cams = [stack[i] for i in shuffled(len(stack), iteration)[: opt.batch_size]]
-        packages = [render(viewpoint_cam, gaussians, bg_color, stage) for viewpoint_cam in viewpoint_cams]
-        radii = torch.stack([package["radii"] for package in packages]).amax(0)
-        visibility_filter = torch.stack([package["visibility_filter"] for package in packages]).any(0)
-        last_max_weight = torch.stack([package["max_weight_t"] for package in packages]).amax(0)
-        image_tensor = torch.stack([package["render"] for package in packages])
-        gt_image_tensor = torch.stack([camera.original_image for camera in viewpoint_cams])
-        loss = l1_loss(image_tensor, gt_image_tensor)
-        loss.backward()
-        viewspace_point_tensor_grad = sum(package["viewspace_points"].grad for package in packages)
-        with torch.no_grad():
-            gaussians._max_weight = torch.max(gaussians._max_weight, last_max_weight)
-            densify(gaussians, opt, iteration, viewspace_point_tensor_grad, visibility_filter, radii)
-            if iteration < opt.densify_until_iter and iteration % 31 == 0:
-                gaussians.weight_prune(0.02)
-            if iteration < opt.iterations:
-                gaussians.optimizer.step()
-                gaussians.optimizer.zero_grad(set_to_none = True)
-                gaussians.hash_optimizer.step()
-                gaussians.hash_optimizer.zero_grad(set_to_none = True)
-    return SimpleNamespace(**locals())
