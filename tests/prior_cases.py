@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from benchmarks.emulated_multiview import emulated_multiview
-from d2_plugin.recordings.recording import Recording, Source
+from d2_plugin.recordings.recording import Camera, Recording, Source
 
 Shown = Callable[[str, int], "np.ndarray | None"]
 
@@ -22,6 +22,23 @@ def showing(recording: Recording, instead: dict[str, Shown], **changes: object) 
     source = Source()
     vars(source).update({kind: getattr(recording.source, kind) for kind in MAPS} | instead)
     return replace(recording, source=source, **changes)
+
+
+def camera_at(
+    place: Sequence[float] = (0, 0, 0),
+    turn: float = 0,
+    *,
+    size: tuple[int, int],
+    focal: float | None = None,
+    principal: Sequence[float] = (0.5, 0.5),
+) -> Camera:
+    """Turned by `turn` about the vertical; a focal length of the width where none is given; `principal` in shares."""
+    T = np.eye(4)
+    T[:3, :3] = [[np.cos(turn), 0, np.sin(turn)], [0, 1, 0], [-np.sin(turn), 0, np.cos(turn)]]
+    T[:3, 3] = -T[:3, :3] @ place
+    length = focal or size[0]
+    K = np.array([[length, 0, principal[0] * size[0]], [0, length, principal[1] * size[1]], [0, 0, 1.0]])
+    return Camera("camera", *size, K, T)
 
 
 def contents(path: Path) -> dict[str, bytes]:

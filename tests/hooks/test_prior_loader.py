@@ -58,7 +58,7 @@ class Plain:
 def test_codes_say_what_the_maps_say(store: PriorStore) -> None:
     coded, plain = PriorLoader(store), PriorLoader(Plain(store))
     for frame in range(3):
-        view, written = view_of(frame), a_prior(frame)
+        view = view_of(frame)
         one, other = coded(view), plain(view)
         for ours, theirs in zip(one, other, strict=True):
             assert torch.equal(ours, theirs)
@@ -67,12 +67,6 @@ def test_codes_say_what_the_maps_say(store: PriorStore) -> None:
             assert torch.equal(torch.as_tensor(ours), torch.as_tensor(theirs))
         known = KnownMaps.of(one)
         assert (known.near, known.far) == coded.known(view)[3:]
-        kept = one.labels.numpy() != Label.EMPTY
-        error = np.abs(one.depth.numpy() / np.where(kept, written.depth, 1) - 1)[kept].max()
-        assert error < 1.1e-4 + 2e-6  # half a code of 1e-3 to 1e3, and single precision
-        finite = np.isfinite(written.sigma) & (written.sigma > 0)
-        np.testing.assert_allclose(one.sigma.numpy()[finite], written.sigma[finite], rtol=0.02)
-        assert np.array_equal(one.sigma.numpy() == 0, written.sigma == 0)
 
 
 def test_memory_holds_eight_bytes_a_pixel_and_the_log_says_when_it_is_full(
@@ -93,18 +87,6 @@ def test_memory_holds_eight_bytes_a_pixel_and_the_log_says_when_it_is_full(
     ]
 
 
-def test_what_comes_next_is_read_in_a_thread_once(store: PriorStore) -> None:
-    plain = Plain(store)
-    loader = PriorLoader(plain)
-    loader.prefetch([("cam0", 3)])  # before the first view nobody knows what the trainer calls its cameras
-    loader.name_by(None)
-    loader(view_of(0))
-    loader.prefetch([("cam0", 1), ("cam0", 0), ("cam0", 1)])
-    loader(view_of(1))
-    loader(view_of(2))
-    assert plain.reads == [(0, True), (1, False), (2, True)]
-
-
 def test_a_failure_ahead_is_raised_when_its_view_comes(store: PriorStore) -> None:
     loader = PriorLoader(store)
     loader.name_by(None)
@@ -115,14 +97,15 @@ def test_a_failure_ahead_is_raised_when_its_view_comes(store: PriorStore) -> Non
         loader(replace(view_of(0), camera="nobody"))
 
 
-def test_d2_reads_ahead_what_a_trainer_says_comes_next(store: PriorStore) -> None:
+def test_what_a_trainer_says_comes_next_is_read_in_a_thread_once(store: PriorStore) -> None:
     plain = Plain(store)
     d2 = D2Hooks(ALL_HOOKS, make_adapter(make_model()), plain)
-    d2.prefetch([view_of(1)])  # not before the first view
+    d2.prefetch([view_of(3)])  # before the first view nobody knows what the trainer calls its cameras
     d2.loss(1, view_of(0))
-    d2.prefetch([view_of(1), "a camera that nobody knows"])
+    d2.prefetch([view_of(1), view_of(0), view_of(1), "a camera that nobody knows"])
     d2.loss(2, view_of(1))
-    assert plain.reads == [(0, True), (1, False)]
+    d2.loss(3, view_of(2))
+    assert plain.reads == [(0, True), (1, False), (2, True)]
 
 
 class RecordingStore(TinyStore):
@@ -137,10 +120,6 @@ def load_all(change: Callable[[View], View]) -> None:
     loader = PriorLoader(RecordingStore())
     for view in make_views():
         loader(change(view))
-
-
-def unchanged(view: View) -> View:
-    return view
 
 
 def turned_and_shifted(view: View) -> View:
@@ -176,7 +155,7 @@ def shifted_image(view: View) -> View:
     return replace(view, K=K)
 
 
-@pytest.mark.parametrize("change", [unchanged, turned_and_shifted, sloppily_orthonormal])
+@pytest.mark.parametrize("change", [turned_and_shifted, sloppily_orthonormal])
 def test_what_changes_no_depth_is_accepted(change: Callable[[View], View]) -> None:
     load_all(change)
 

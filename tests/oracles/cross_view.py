@@ -1,18 +1,17 @@
 """`d2_plugin.priors.evidence` in NumPy: what the kernel of `cross_view` must return but for the last digits.
 
-NumPy and the C library round logarithms and exponentials differently.
+NumPy and the C library round logarithms and exponentials differently. All points of a view are asked everything, and
+what does not hold is masked afterwards.
 """
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
-from d2_plugin.priors.cross_view import kernel
 from d2_plugin.priors.cross_view.kernel import (
     BESIDE,
     COMPARED,
@@ -29,6 +28,7 @@ from d2_plugin.priors.cross_view.kernel import (
     OVERSHOT,
     STEPS,
     WITHIN,
+    View,
 )
 from d2_plugin.priors.evidence import AGREED, ALONE, AT_BEST, view_of
 from d2_plugin.priors.fuse import FusedPrior
@@ -45,12 +45,23 @@ def with_evidence(
     tails: Mapping[str, float] | None = None,
 ) -> dict[str, FusedPrior]:
     """As `evidence.with_evidence`."""
-    views = {name: View(**vars(view_of(prior))) for name, prior in priors.items()}
+    views = {name: view_of(prior) for name, prior in priors.items()}
     known = {name: tail for name, tail in (tails or {}).items() if tail >= 1}
     return {
         name: _informed(name, prior, views, cameras, tolerance, AGREED / known.get(name, 1.0))
         for name, prior in priors.items()
     }
+
+
+class Points(NamedTuple):
+    """K pixels of one view with the depth and sigma that are asked about."""
+
+    columns: np.ndarray
+    rows: np.ndarray
+    depth: np.ndarray
+    sigma: np.ndarray
+    colors: np.ndarray | None
+    """Mean of 3x3 pixels, [K, 3]; None where there is no image."""
 
 
 def _informed(
@@ -66,126 +77,64 @@ def _informed(
     depth, sigma = (map_[rows, columns].astype(np.float64) for map_ in (prior.depth, prior.sigma))
     colors = views[name].colors
     points = Points(columns, rows, depth, sigma, None if colors is None else colors[rows, columns])
-    answer = ask(points, name, views, cameras, tolerance)
-    met, agreed = answer.depth > 0, answer.agreed
-    factor = np.where(agreed, agreeing, np.where(answer.seen, ALONE, 1.0))
-    labels, depths, sigmas = prior.labels.copy(), prior.depth.copy(), prior.sigma.copy()
-    labels[rows, columns] = np.where(met | agreed, Label.AGREED, Label.MONO)
-    depths[rows, columns] = np.where(met, answer.depth, depth)
-    sigmas[rows, columns] = np.where(met, answer.sigma, np.hypot(factor * sigma, np.where(agreed, AT_BEST, 0)))
-    return replace(prior, depth=depths, labels=labels, sigma=sigmas)
-
-
-class Points(NamedTuple):
-    """K pixels of one view with the depth and sigma that are asked about."""
-
-    columns: np.ndarray
-    rows: np.ndarray
-    depth: np.ndarray
-    sigma: np.ndarray
-    colors: np.ndarray | None
-    """Mean of 3x3 pixels, uint8 [K, 3]; None where there is no image."""
-
-    def only(self, chosen: np.ndarray) -> Points:
-        return Points._make(None if values is None else values[chosen] for values in self)
-
-
-class Answer(NamedTuple):
-    """What the other cameras make of K points; all [K]."""
-
-    depth: np.ndarray
-    """Depth at which the ray meets a surface of another camera, float64; 0 where there is none."""
-    sigma: np.ndarray
-    """Of that depth, float64; infinite where there is none."""
-    agreed: np.ndarray
-    """Whether the monocular depth of another camera agrees, and the colours are alike, bool."""
-    seen: np.ndarray
-    """Whether another camera has a depth where the point lies in its image, bool."""
-
-
-class View(kernel.View):
-    """One view of an instant."""
-
-    @functools.cached_property
-    def surface(self) -> np.ndarray:
-        """Depth that stereo verified, 0 elsewhere."""
-        return np.where((self.labels == Label.VERIFIED) & (self.depth > 0), self.depth, np.float32(0))
-
-    @functools.cached_property
-    def compared(self) -> tuple[np.ndarray, np.ndarray]:
-        """Rows and columns of some verified pixels, evenly over the image."""
-        known = np.flatnonzero(self.surface)
-        rows, columns = np.divmod(known[:: max(len(known) // COMPARED, 1)], self.surface.shape[1])
-        return rows, columns
-
-    def apart(self, at: tuple[np.ndarray, np.ndarray], logs: np.ndarray, labels: tuple[Label, ...]) -> np.ndarray:
-        """|log difference| [K] of points to the depths of pixels with one of the labels; infinite at others."""
-        found = self.labels[at]
-        labelled = functools.reduce(np.logical_or, [found == label for label in labels])
-        return np.where(labelled, np.abs(logs - self.log[at]), np.inf)
-
-
-def ask(
-    points: Points, name: str, views: Mapping[str, View], cameras: Mapping[str, Camera], tolerance: float
-) -> Answer:
-    """What all others show of points of view `name`; `tolerance` is in log depth."""
-    count = len(points.depth)
-    depth, sigma = np.zeros(count), np.full(count, np.inf)
-    agreed, seen = np.zeros(count, bool), np.zeros(count, bool)
+    surface, surest = np.zeros(len(depth)), np.full(len(depth), np.inf)
+    agreed, seen = np.zeros(len(depth), bool), np.zeros(len(depth), bool)
     for other, theirs in views.items():
-        if other == name or not count:
+        if other == name:
             continue
         pair = view_pair(cameras[name], cameras[other])
         gain = _gain(views[name], theirs, pair)
         asked = points if points.colors is None else points._replace(colors=points.colors * gain)
-        place, at, logs = _inside(asked, pair, theirs.depth.shape)
-        apart = theirs.apart(at, logs, (Label.MONO, Label.AGREED))
-        seen[place] |= np.isfinite(apart)
-        close = np.flatnonzero(apart < tolerance)
-        agreed[place[close]] |= _alike(asked.only(place[close]), theirs, *(values[close] for values in at))
-        near = place[theirs.apart(at, logs, (Label.VERIFIED,)) < MISSED]
-        found, precision = _intersection(asked.only(near), pair, theirs)
-        seen[near] |= found > 0
-        better = precision < sigma[near]
-        depth[near[better]], sigma[near[better]] = found[better], precision[better]
-    return Answer(depth, sigma, agreed, seen)
+        at, apart = _apart(asked, pair, theirs, (Label.MONO, Label.AGREED))
+        followed = _apart(asked, pair, theirs, (Label.VERIFIED,))[1] < MISSED
+        found, precision = _intersection(asked, pair, theirs, followed)
+        seen |= np.isfinite(apart) | (found > 0)
+        agreed |= (apart < tolerance) & _alike(asked, theirs, *at)
+        better = precision < surest
+        surface, surest = np.where(better, found, surface), np.where(better, precision, surest)
+    met = surface > 0
+    factor = np.where(agreed, agreeing, np.where(seen, ALONE, 1.0))
+    labels, depths, sigmas = prior.labels.copy(), prior.depth.copy(), prior.sigma.copy()
+    labels[rows, columns] = np.where(met | agreed, Label.AGREED, Label.MONO)
+    depths[rows, columns] = np.where(met, surface, depth)
+    sigmas[rows, columns] = np.where(met, surest, np.hypot(factor * sigma, np.where(agreed, AT_BEST, 0)))
+    return replace(prior, depth=depths, labels=labels, sigma=sigmas)
 
 
-def _inside(
-    points: Points, pair: ViewPair, shape: tuple[int, ...]
-) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray], np.ndarray]:
-    """(indices [I] of the points that fall into another view's image, nearest pixels there, log depth there)."""
+def _apart(
+    points: Points, pair: ViewPair, theirs: View, labels: tuple[Label, ...]
+) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
+    """(nearest pixels in another view, |log difference| [K] to their depths; infinite where labels are others)."""
     x, y, z = pair.project(points.columns, points.rows, points.depth)
-    height, width = shape
-    place = np.flatnonzero((z > 0) & (x > -0.5) & (x < width - 0.5) & (y > -0.5) & (y < height - 0.5))
-    row, column = (np.rint(values[place]).astype(np.int64) for values in (y, x))
-    return place, (row, column), np.log(z[place])
+    height, width = theirs.depth.shape
+    inside = (z > 0) & (x > -0.5) & (x < width - 0.5) & (y > -0.5) & (y < height - 0.5)
+    row, column = (np.rint(np.where(inside, values, 0)).astype(np.int64) for values in (y, x))
+    compared = inside & np.isin(theirs.labels[row, column], labels)
+    return (row, column), np.where(compared, np.abs(np.log(np.where(inside, z, 1)) - theirs.log[row, column]), np.inf)
 
 
-def _intersection(points: Points, pair: ViewPair, theirs: View) -> tuple[np.ndarray, np.ndarray]:
-    """Where the points' rays meet the surface that another view verified: (depth [K], 0 where nowhere; sigma [K])."""
-    surface, near = theirs.surface, np.arange(len(points.depth))
-    depth, sigma = np.zeros_like(points.depth), np.full_like(points.depth, np.inf)
+def _surface(view: View) -> np.ndarray:
+    """Depth that stereo verified, 0 elsewhere."""
+    return np.where((view.labels == Label.VERIFIED) & (view.depth > 0), view.depth, np.float32(0))
+
+
+def _intersection(points: Points, pair: ViewPair, theirs: View, followed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where followed rays meet the surface that another view verified: (depth [K], 0 where nowhere; sigma [K])."""
+    surface, allowed = _surface(theirs), np.minimum(WITHIN * points.sigma, NEAR)
     miss, known = _miss(points, pair, surface, points.depth)
-    near, miss, points = near[known], miss[known], points.only(known)
     step = _step(points, pair, surface, points.depth, miss)
-    kept = np.abs(step) < OVERSHOT * _allowed(points)
-    near, step, points = near[kept], step[kept], points.only(kept)
+    followed = followed & known & (np.abs(step) < OVERSHOT * allowed)
     along = points.depth * np.exp(step)
     for _ in range(STEPS - 1):
         miss, known = _miss(points, pair, surface, along)
         along = along * np.exp(np.where(known, _step(points, pair, surface, along, miss), 0))
     miss, known = _miss(points, pair, surface, along)
     moved = np.abs(np.log(along / points.depth))
-    met = known & (np.abs(miss) < MET) & (moved < _allowed(points))
+    met = followed & known & (np.abs(miss) < MET) & (moved < allowed)
     at = pair.project(points.columns, points.rows, along)
-    height, width = surface.shape
-    row = np.clip(np.rint(np.where(met, at.y, 0)), 0, height - 1).astype(np.int64)
-    column = np.clip(np.rint(np.where(met, at.x, 0)), 0, width - 1).astype(np.int64)
+    row, column = (np.rint(np.where(met, values, 0)).astype(np.int64) for values in (at.y, at.x))
     met &= _alike(points, theirs, row, column)
-    depth[near] = np.where(met, along, 0)
-    sigma[near] = np.where(met, np.hypot(theirs.sigma[row, column], BESIDE * moved), np.inf)
-    return depth, sigma
+    return np.where(met, along, 0), np.where(met, np.hypot(theirs.sigma[row, column], BESIDE * moved), np.inf)
 
 
 def _alike(points: Points, theirs: View, row: np.ndarray, column: np.ndarray) -> np.ndarray:
@@ -198,22 +147,18 @@ def _alike(points: Points, theirs: View, row: np.ndarray, column: np.ndarray) ->
 
 def _gain(ours: View, theirs: View, pair: ViewPair) -> np.ndarray:
     """How much brighter the other camera shows what both verified, per channel [3]; 1 where that is too little."""
-    rows, columns = ours.compared
-    if ours.colors is None or theirs.colors is None or len(rows) < FEWEST:
+    surface = _surface(ours)
+    known = np.flatnonzero(surface)
+    if ours.colors is None or theirs.colors is None or len(known) < FEWEST:
         return np.ones(3, np.float32)
-    depth, mine = ours.surface[rows, columns].astype(np.float64), ours.colors[rows, columns].astype(np.float32)
-    place, at, logs = _inside(Points(columns, rows, depth, depth, mine), pair, theirs.surface.shape)
+    rows, columns = np.divmod(known[:: max(len(known) // COMPARED, 1)], surface.shape[1])
+    depth, mine = surface[rows, columns].astype(np.float64), ours.colors[rows, columns].astype(np.float32)
+    at, apart = _apart(Points(columns, rows, depth, depth, mine), pair, theirs, (Label.VERIFIED,))
     seen = theirs.colors[at].astype(np.float32)
-    one_place = theirs.apart(at, logs, (Label.VERIFIED,)) < ONE_PLACE
-    bright = one_place & (np.minimum(mine[place], seen) > DARK).all(axis=1)
+    bright = (apart < ONE_PLACE) & (np.minimum(mine, seen) > DARK).all(axis=1)
     if np.count_nonzero(bright) < FEWEST:
         return np.ones(3, np.float32)
-    return np.median(seen[bright] / mine[place[bright]], axis=0)
-
-
-def _allowed(points: Points) -> np.ndarray:
-    """How far in log depth [K] a ray may be followed."""
-    return np.minimum(WITHIN * points.sigma, NEAR)
+    return np.median(seen[bright] / mine[bright], axis=0)
 
 
 def _step(points: Points, pair: ViewPair, surface: np.ndarray, depth: np.ndarray, miss: np.ndarray) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
 import numpy as np
@@ -53,18 +54,16 @@ def coherence(
     padded_gray = np.pad(values, radius, constant_values=1000)
     tolerance = np.float32(relative) * inverse
     agreeing, total = np.zeros_like(inverse), np.zeros_like(inverse)
-    for dy, dx in _offsets(radius, stride):
+    steps = range(-radius, radius + 1, stride)
+    for dy, dx in itertools.product(steps, steps):
+        if (dy, dx) == (0, 0):
+            continue
         window = np.s_[radius + dy : radius + dy + height, radius + dx : radius + dx + width]
         weight = weights[np.minimum(np.abs(padded_gray[window] - values), 256)]
         distance = padded_inverse[window] - inverse - dx * slopes[0] - dy * slopes[1]
         total += weight
         agreeing += weight * (np.abs(distance) < tolerance)
     return agreeing / np.maximum(total, np.finfo(np.float32).tiny)
-
-
-def _offsets(radius: int, stride: int) -> list[tuple[int, int]]:
-    steps = range(-radius, radius + 1, stride)
-    return [(dy, dx) for dy in steps for dx in steps if (dy, dx) != (0, 0)]
 
 
 def slopes(depth: np.ndarray, reach: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -96,42 +95,32 @@ def add_source(
     settings: StereoSettings,
     tolerance: float,
 ) -> None:
-    """Add what one source says of `depth` [H, W] to the sums: the bits of the kernel.
-
-    Each test is made of those alone that passed the one before.
-    """
-    rows, columns = np.nonzero(depth > 0)
-    u, v, depth = columns.astype(np.float32), rows.astype(np.float32), depth[rows, columns]
-    rays = viewing_rays(reference)[rows, columns]
+    """Add what one source says of `depth` [H, W] to the sums: the bits of the kernel."""
+    v, u = np.indices(depth.shape, np.float32)
     pair, way_back = view_pair(reference, source), view_pair(source, reference)
     forth = pair.project(u, v, depth)
     seen = (sample_surface if settings.between_pixels else sample_nearest)(theirs, forth)
-    place = np.flatnonzero(seen > 0)
-    u, v, depth, rays, seen = u[place], v[place], depth[place], rays[place], seen[place]
-    forth = Projection(*(values[place] for values in forth))
     back = way_back.project(forth.x, forth.y, seen)
     off_x, off_y = back.x - u, back.y - v
-    near = np.sqrt(off_x * off_x + off_y * off_y) < np.float32(REPROJECTION_MAX)
+    near = (depth > 0) & (seen > 0) & (np.sqrt(off_x * off_x + off_y * off_y) < np.float32(REPROJECTION_MAX))
     near &= np.abs(back.z - depth) < np.float32(tolerance) * depth
-    near &= _meet(rays, depth, pair, settings)
-    nudged = pair.project(u[near].astype(np.float64), v[near].astype(np.float64), depth[near] * np.exp(NUDGE))
-    moved_x, moved_y = nudged.x - forth.x[near], nudged.y - forth.y[near]
+    near &= _meet(viewing_rays(reference), depth, pair, settings)
+    nudged = pair.project(u.astype(np.float64), v.astype(np.float64), depth * np.exp(NUDGE))
+    moved_x, moved_y = nudged.x - forth.x, nudged.y - forth.y
     squared = (moved_x * moved_x + moved_y * moved_y) / NUDGE**2
-    precision = np.where(np.isfinite(squared), squared, 0)
-    apart = back.z[near] / depth[near] - 1
-    at = rows[place][near], columns[place][near]
-    sums.confirming[at] += 1
-    sums.information[at] += precision
-    sums.difference[at] += precision * (apart * apart)
+    precision, apart = np.where(np.isfinite(squared), squared, 0), back.z / depth - 1
+    sums.confirming[:] += near
+    sums.information[:] += np.where(near, precision, 0)
+    sums.difference[:] += np.where(near, precision * (apart * apart), 0)
 
 
 def _meet(rays: np.ndarray, depth: np.ndarray, pair: ViewPair, settings: StereoSettings) -> np.ndarray:
-    """Whether the rays of both cameras meet at an angle that is allowed, [K].
+    """Whether the rays of both cameras meet at an angle that is allowed, [H, W].
 
     |a x b| and a.b are its sine and cosine times the same length. In units of the depth, so that no unit of the world
     overflows.
     """
-    (x, y, z), direction = rays.T, pair.direction.astype(np.float32)
+    (x, y, z), direction = np.moveaxis(rays, -1, 0), pair.direction.astype(np.float32)
     u, v, w = x - direction[0] / depth, y - direction[1] / depth, z - direction[2] / depth
     p, q, r = y * w - z * v, z * u - x * w, x * v - y * u
     sine, cosine = np.sqrt(p * p + q * q + r * r), x * u + y * v + z * w

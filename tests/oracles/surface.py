@@ -1,11 +1,10 @@
-"""Depth maps in NumPy: between their pixels, as the kernels of filter and `cross_view` read them, and in the world."""
+"""Depth maps in NumPy between their pixels, as the kernels of filter and `cross_view` read them."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from d2_plugin.priors.geometry import CONTINUOUS, viewing_rays
-from d2_plugin.recordings.recording import Camera
+from d2_plugin.priors.geometry import CONTINUOUS
 
 
 def interpolated_surface(depth: np.ndarray, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -27,10 +26,3 @@ def interpolated_surface(depth: np.ndarray, x: np.ndarray, y: np.ndarray) -> tup
     inverse = [1 / np.where(known, corner, 1).astype(np.float64) for corner in corners]
     upper, lower = (inverse[i] * (1 - right) + inverse[i + 1] * right for i in (0, 2))
     return known, 1 / (upper * (1 - down) + lower * down)
-
-
-def back_project(camera: Camera, depth: np.ndarray) -> np.ndarray:
-    """World points [H, W, 3] float64 of a planar depth map [H, W]."""
-    points = viewing_rays(camera, np.float64) * depth[..., None].astype(np.float64)
-    R, t = camera.T_camera_world[:3, :3], camera.T_camera_world[:3, 3]
-    return (points - t) @ R

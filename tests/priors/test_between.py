@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,7 +14,6 @@ from d2_plugin.priors.between import build_between
 from d2_plugin.priors.scene_flow import Flight, common_acceleration, dense_flow, followed, regions
 from d2_plugin.priors.sheet import contact_sheet
 from d2_plugin.protocol import Label
-from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.store.exported import RenamedStore
 from d2_plugin.store.maps import FusedPrior
 from d2_plugin.store.store import QUARTERS, PriorStore
@@ -52,28 +52,28 @@ def way(instant: float) -> tuple[float, float]:
     return tuple(FOCAL * position[:2] / BALL_DEPTH + np.array([WIDTH, HEIGHT]) / 2 - 0.5)
 
 
-def thrown(path: Path, count: int = 5, cameras: int = 3, **changes: np.ndarray) -> PriorStore:
-    """Finished priors of cameras in one place; `changes` are other images by frame, as `frame3=...`."""
-    names = [f"cam{index}" for index in range(cameras)]
-    store = PriorStore.create(path, names, range(count), {"recording": "thrown"})
+def thrown(path: Path, count: int, cameras: int = 1, changes: dict[int, np.ndarray] | None = None) -> PriorStore:
+    """Finished priors of cameras in one place; `changes` are other images by frame."""
+    store = PriorStore.create(path, [f"cam{index}" for index in range(cameras)], range(count), {"recording": "thrown"})
     camera = {"K": [[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]], "T_camera_world": np.eye(4).tolist()}
-    for name in names:
-        for frame in range(count):
-            mask = ball(*way(frame))
-            prior = FusedPrior(
-                np.where(mask, BALL_DEPTH, WALL_DEPTH).astype(np.float32),
-                np.full((HEIGHT, WIDTH), Label.VERIFIED, np.uint8),
-                np.full((HEIGHT, WIDTH), 0.01, np.float32),
-                changes.get(f"frame{frame}", shown(mask)),
-            )
-            record = {
-                "key": f"{name} {frame}",
-                "camera": camera,
-                "shares": prior.shares(),
-                "refused": "",
-                "monocular": "",
-            }
-            store.write(name, frame, prior, record)
+    for name, frame in itertools.product(store.cameras, store.frames):
+        mask = ball(*way(frame))
+        prior = FusedPrior(
+            np.where(mask, BALL_DEPTH, WALL_DEPTH).astype(np.float32),
+            np.full((HEIGHT, WIDTH), Label.VERIFIED, np.uint8),
+            np.full((HEIGHT, WIDTH), 0.01, np.float32),
+            (changes or {}).get(frame, shown(mask)),
+        )
+        about = {"key": f"{name} {frame}", "camera": camera, "shares": prior.shares(), "refused": "", "monocular": ""}
+        store.write(name, frame, prior, about)
+    return store
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory: pytest.TempPathFactory) -> PriorStore:
+    """Five instants and what lies between them, to be read only."""
+    store = thrown(tmp_path_factory.mktemp("flown"), 5, 2)
+    assert build_between(store) == 8
     return store
 
 
@@ -150,11 +150,11 @@ class TestFlights:
 
 
 class TestHalfway:
-    def test_a_thrown_ball_is_on_its_parabola_with_its_depth_and_nothing_is_there_twice(self, tmp_path: Path) -> None:
-        store = thrown(tmp_path, 5, 2)
-        assert build_between(store) == 8
+    def test_a_thrown_ball_is_on_its_parabola_with_its_depth_and_nothing_is_there_twice(
+        self, flown: PriorStore
+    ) -> None:
         for frame, quarter in itertools.product(range(4), QUARTERS):
-            following, halfway = store.underway("cam1", frame, quarter)
+            following, halfway = flown.underway("cam1", frame, quarter)
             assert following == frame + 1
             inner, around = (ball(*way(frame + quarter / 4), RADIUS + by) for by in (-2, 2))
             image, depth = halfway.colors.numpy().astype(int), halfway.depth.numpy()
@@ -166,7 +166,7 @@ class TestHalfway:
             np.testing.assert_array_equal(depth > 0, np.isin(halfway.labels, (Label.VERIFIED,)))
 
     def test_where_nothing_moves_it_is_the_image_and_no_depth_is_proposed(self, tmp_path: Path) -> None:
-        store = thrown(tmp_path, 3, 1, **{f"frame{frame}": shown() for frame in range(3)})
+        store = thrown(tmp_path, 3, changes={frame: shown() for frame in range(3)})
         build_between(store)
         halfway = store.underway("cam0", 0, 2)[1]
         np.testing.assert_array_equal(halfway.colors, shown())
@@ -176,68 +176,53 @@ class TestHalfway:
     def test_motion_is_not_known_where_both_instants_contradict_each_other(self, tmp_path: Path) -> None:
         sign = wall()
         sign[20:40, 80:110] = 250
-        store = thrown(tmp_path, 4, 1, frame0=wall(), frame1=sign, frame2=wall(), frame3=wall())
+        store = thrown(tmp_path, 3, changes={0: wall(), 1: sign, 2: wall()})
         build_between(store)
         labels = store.underway("cam0", 0, 2)[1].labels
         assert (labels[22:38, 82:108] == Label.CONFLICT).float().mean() > 0.5
         assert (labels[45:, :70] == Label.EMPTY).all()
 
     def test_of_light_that_changes_everywhere_nothing_is_known(self, tmp_path: Path) -> None:
-        store = thrown(tmp_path, 4, 1, frame2=shown() + 60)
+        store = thrown(tmp_path, 3, changes={2: shown() + 60})
         build_between(store)
         assert (store.underway("cam0", 1, 2)[1].labels == Label.CONFLICT).all()
         assert (store.underway("cam0", 0, 2)[1].labels != Label.CONFLICT).float().mean() > 0.9
 
     def test_it_is_made_once_and_anew_where_it_is_damaged_or_a_prior_changed(self, tmp_path: Path) -> None:
-        store = thrown(tmp_path, 3, 1)
+        store = thrown(tmp_path, 3)
         assert build_between(store) == 2
         assert build_between(store) == 0
         path = store.between[2].location("cam0", 1)
         path.write_bytes(path.read_bytes()[:-1] + b"x")
         assert build_between(store) == 2
-        store.write("cam0", 2, store_maps(store, "cam0", 2), store.record("cam0", 2) | {"key": "another"})
+        prior = store.prior("cam0", 2)
+        maps = FusedPrior(*(map_.numpy() for map_ in (prior.depth, prior.labels, prior.sigma, prior.colors)))
+        store.write("cam0", 2, maps, store.record("cam0", 2) | {"key": "another"})
         assert build_between(store) == 2
 
     @pytest.mark.parametrize("count", [1, 2])
     def test_too_few_instants_have_none_between(self, tmp_path: Path, count: int) -> None:
-        store = thrown(tmp_path, count, 1)
+        store = thrown(tmp_path, count)
         assert build_between(store) == 0
         assert store.underway("cam0", 0, 2) is None
 
     def test_nor_have_those_of_an_unfinished_build(self, tmp_path: Path) -> None:
-        store = thrown(tmp_path, 4, 1)
+        store = thrown(tmp_path, 4)
         store.entries.location("cam0", 2).with_suffix(".json").unlink()
         assert build_between(store) == 0
 
-    def test_an_export_has_it_under_its_own_names(self, tmp_path: Path) -> None:
-        store = thrown(tmp_path, 4, 1)
-        build_between(store)
-        renamed = RenamedStore(store, {"a": "cam0"}, {10: 1, 11: 2})
+    def test_an_export_has_it_under_its_own_names(self, flown: PriorStore) -> None:
+        renamed = RenamedStore(flown, {"a": "cam0"}, {10: 1, 11: 2})
         following, halfway = renamed.underway("a", 10, 2)
         assert following == 11
-        assert torch.equal(halfway.colors, store.underway("cam0", 1, 2)[1].colors)
+        assert torch.equal(halfway.colors, flown.underway("cam0", 1, 2)[1].colors)
         assert renamed.underway("a", 11, 2) is None  # frame 3 was not exported
 
-    def test_the_contact_sheet_shows_it_below_the_priors(self, tmp_path: Path) -> None:
-        store, recording = thrown(tmp_path, 3, 1), synthetic_recording(cameras=1, held_out=0, frames=1)
-        alone = cv2.imread(str(contact_sheet(store, _Of(recording), tmp_path / "a.png", [0], width=64)))
-        build_between(store)
-        both = cv2.imread(str(contact_sheet(store, _Of(recording), tmp_path / "b.png", [0], width=64)))
+    def test_the_contact_sheet_shows_it_below_the_priors(self, flown: PriorStore, tmp_path: Path) -> None:
+        recording = SimpleNamespace(frames=flown.frames, image=lambda camera, frame: shown(ball(*way(frame))))
+        stores = thrown(tmp_path, 5, 2), flown
+        alone, both = (
+            cv2.imread(str(contact_sheet(store, recording, tmp_path / "sheet.png", [0], width=64))) for store in stores
+        )
         np.testing.assert_array_equal(both[: len(alone)], alone)
-        assert len(both) == len(alone) + 18 + 64 * HEIGHT // WIDTH
-
-
-class _Of:
-    """A recording as far as the sheet reads it."""
-
-    def __init__(self, recording: object) -> None:
-        self.frames = (0, 1, 2)
-
-    def image(self, camera: str, frame: int) -> np.ndarray:
-        return shown(ball(*way(frame)))
-
-
-def store_maps(store: PriorStore, camera: str, frame: int) -> FusedPrior:
-    """A prior as it was written."""
-    prior = store.prior(camera, frame)
-    return FusedPrior(*(map_.numpy() for map_ in (prior.depth, prior.labels, prior.sigma, prior.colors)))
+        assert len(both) == len(alone) + 2 * (18 + 64 * HEIGHT // WIDTH)

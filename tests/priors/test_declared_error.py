@@ -167,7 +167,7 @@ def test_sigma_holds_on_a_recording_with_true_depth(
 
 
 def test_sigma_holds_in_a_rendered_room(tmp_path: Path) -> None:
-    recording = synthetic_recording(cameras=4, held_out=0, frames=1, width=240, height=135, seed=1)
+    recording = synthetic_recording(cameras=3, held_out=0, frames=1, width=192, height=108, seed=1)
     found = measured(recording, list(recording.cameras), tmp_path)
     check(found)
     assert found.false_far == 0

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from oracles.surface import back_project
 from prior_cases import showing, write_dense_array
 
 from d2_plugin.errors import D2Error
@@ -19,7 +17,6 @@ from d2_plugin.priors.colmap.workspace import WorkspaceDepth, scale_of_world, se
 from d2_plugin.priors.depth_on_disk import DepthOnDisk, SensorDepth, find_depth_on_disk
 from d2_plugin.priors.frame import Frame
 from d2_plugin.priors.geometry import index_intrinsics
-from d2_plugin.priors.maps_on_disk import planar
 from d2_plugin.priors.settings import PriorSettings, StereoSettings
 from d2_plugin.protocol import Label
 from d2_plugin.recordings.cameras.camera import pinhole
@@ -58,8 +55,8 @@ def still(recording: Recording) -> Recording:
 def write_sensor(recording: Recording, description: dict, step: float = 1e-3, suffix: str = ".png") -> Path:
     """Sensor maps of the first two cameras, `step` world units a number."""
     folder = recording.path / "depth"
-    for name in NAMES[:2]:
-        (folder / name).mkdir(parents=True)
+    for name in list(recording.cameras)[:2]:
+        (folder / name).mkdir(parents=True, exist_ok=True)
         for frame in recording.frames:
             stored = recording.depth(name, frame) / step
             path = folder / name / f"{frame:05d}{suffix}"
@@ -71,34 +68,24 @@ def write_sensor(recording: Recording, description: dict, step: float = 1e-3, su
     return folder
 
 
-def write_maps(recording: Recording, place: str, frame: int, scale: float = 1.0, kind: str = "geometric") -> Path:
-    """A workspace with the true depth of all cameras in a world of another scale."""
+def write_maps(recording: Recording, place: str, frame: int, scale: float = 1.0) -> Path:
+    """A workspace with the true depth of all cameras in a world of another scale, and COLMAP's text model without
+    points. Its PatchMatch takes K in array indices."""
     folder = recording.path / place
     maps = folder / "stereo" / "depth_maps"
     maps.mkdir(parents=True)
     (folder / "sparse").mkdir()
-    cameras = []
-    for camera in recording.cameras.values():
-        pose = camera.T_camera_world.copy()
-        pose[:3, 3] *= scale
-        cameras.append(replace(camera, T_camera_world=pose))
-        write_dense_array(maps / f"{camera.name}.png.{kind}.bin", recording.depth(camera.name, frame) * scale)
-    write_model(folder / "sparse", cameras)
+    model = {"cameras": "", "images": "", "points3D": ""}
+    for index, camera in enumerate(recording.cameras.values(), 1):
+        K, pose = index_intrinsics(camera), camera.T_camera_world
+        placed = " ".join(map(str, (*quaternion_of_rotation(pose[:3, :3]), *(scale * pose[:3, 3]))))
+        lens = f"{camera.width} {camera.height} {K[0, 0]} {K[1, 1]} {K[0, 2]} {K[1, 2]}"
+        model["cameras"] += f"{index} PINHOLE {lens}\n"
+        model["images"] += f"{index} {placed} {index} {camera.name}.png\n\n"
+        write_dense_array(maps / f"{camera.name}.png.geometric.bin", recording.depth(camera.name, frame) * scale)
+    for name, lines in model.items():
+        (folder / "sparse" / f"{name}.txt").write_text(lines)
     return folder
-
-
-def write_model(folder: Path, cameras: Sequence[Camera]) -> None:
-    """COLMAP's text model of known cameras without points. Its PatchMatch takes K in array indices."""
-    lenses, images = [], []
-    for index, camera in enumerate(cameras, 1):
-        K = index_intrinsics(camera)
-        numbers = " ".join(repr(float(value)) for value in (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
-        lenses.append(f"{index} PINHOLE {camera.width} {camera.height} {numbers}\n")
-        pose = (*quaternion_of_rotation(camera.T_camera_world[:3, :3]), *camera.T_camera_world[:3, 3])
-        images.append(f"{index} {' '.join(repr(float(v)) for v in pose)} {index} {camera.name}.png\n\n")
-    (folder / "cameras.txt").write_text("".join(lenses))
-    (folder / "images.txt").write_text("".join(images))
-    (folder / "points3D.txt").write_text("")
 
 
 def workspace(recording: Recording, place: str = "") -> WorkspaceDepth:
@@ -122,24 +109,18 @@ def test_sensor_depth_comes_in_world_units(recording: Recording, description: di
     assert found.depth(recording.cameras["train1"], 7) is None
 
 
-def test_what_a_sensor_does_not_know_is_empty(recording: Recording, tmp_path: Path) -> None:
-    folder = write_sensor(recording, {"unit": "m"}, 1.0, ".npy")
-    stored = np.load(folder / "train0" / "00000.npy")
-    stored[0, :4] = np.nan, np.inf, -1, 0
-    np.save(folder / "train0" / "00000.npy", stored)
-    depth = SensorDepth(folder, NAMES).depth(recording.cameras["train0"], 0)
-    assert not depth[0, :4].any()
-    assert depth[1:].all()
-
-
-def test_sensor_depth_comes_at_the_size_of_images_with_fewer_or_more_pixels(recording: Recording) -> None:
+def test_sensor_depth_comes_at_the_size_of_images_with_fewer_or_more_pixels_and_empty_where_it_is_none(
+    recording: Recording,
+) -> None:
     folder = write_sensor(recording, {"unit": "m"}, 1.0, ".npy")
     smaller = downscale(recording, 3)
     depth = SensorDepth(folder, NAMES).depth(smaller.cameras["train0"], 0)
     np.testing.assert_allclose(depth, smaller.depth("train0", 0), rtol=1e-6)
-    coarse = recording.depth("train0", 0)[::2, ::2]
+    coarse = recording.depth("train0", 0)[::2, ::2].copy()
+    coarse[0, :4] = np.nan, np.inf, -1, 0
     np.save(folder / "train0" / "00000.npy", coarse)
     depth = SensorDepth(folder, NAMES).depth(recording.cameras["train0"], 0)
+    coarse[0, :4] = 0
     np.testing.assert_array_equal(depth, coarse.repeat(2, 0).repeat(2, 1))
 
 
@@ -301,17 +282,16 @@ def test_maps_of_the_geometric_pass_come_first(still: Recording) -> None:
 
 
 def test_a_map_of_another_size_and_lens_is_looked_up_ray_by_ray(recording: Recording) -> None:
-    camera = recording.cameras["train0"]
-    v, u = np.mgrid[:90, :160] + 0.5
-    K = camera.K
-    tilted = 4 / (1 + 0.2 * (u - K[0, 2]) / K[0, 0] + 0.1 * (v - K[1, 2]) / K[1, 1])
-    wide = pinhole(150.0, 155.0, 210.0, 120.0)
-    y, x = np.mgrid[:250, :400] + 0.5
-    stored = 4 / (1 + 0.2 * (x - 210) / 150 + 0.1 * (y - 120) / 155)
-    found = seen_by(camera, stored, wide)
+    def tilted(height: int, width: int, K: np.ndarray) -> np.ndarray:
+        v, u = np.mgrid[:height, :width] + 0.5
+        return 4 / (1 + 0.2 * (u - K[0, 2]) / K[0, 0] + 0.1 * (v - K[1, 2]) / K[1, 1])
+
+    camera, wide = recording.cameras["train0"], pinhole(150.0, 155.0, 210.0, 120.0)
+    found = seen_by(camera, tilted(250, 400, wide), wide)
     inside = found > 0
     assert inside.mean() > 0.9
-    np.testing.assert_allclose(found[inside], tilted[inside], rtol=0.005)  # half a pixel of the map's slope
+    expected = tilted(90, 160, camera.K)[inside]
+    np.testing.assert_allclose(found[inside], expected, rtol=0.005)  # half a pixel of the map's slope
 
 
 def test_cameras_of_a_workspace_may_differ_by_a_bundle_adjustment_and_no_more(recording: Recording) -> None:
@@ -407,15 +387,16 @@ def one_sensor(tmp_path: Path) -> Recording:
     """One camera with a depth sensor and no monocular maps of its own."""
     room = synthetic_recording(cameras=1, held_out=0, frames=1, width=96, height=54)
     room = replace(room, path=tmp_path, mono_kind=None)
-    write_map(room, room.depth(ONE, 0), {"scale": 1.0})
+    write_sensor(room, {"scale": 1.0}, 1.0, ".npy")
     return room
 
 
-def write_map(room: Recording, depth: np.ndarray, description: dict) -> None:
-    folder = room.path / "depth" / ONE
-    folder.mkdir(parents=True, exist_ok=True)
-    np.save(folder / "00000.npy", depth)
-    (folder.parent / "depth.json").write_text(json.dumps(description))
+def along_the_ray(room: Recording) -> np.ndarray:
+    """Distances [H, W] of what its camera sees from the camera's centre."""
+    camera = room.cameras[ONE]
+    x, y = (np.arange(size) + 0.5 for size in (camera.width, camera.height))
+    u, v = (x - camera.K[0, 2]) / camera.K[0, 0], (y - camera.K[1, 2]) / camera.K[1, 1]
+    return room.depth(ONE, 0) * np.sqrt(1 + u**2 + v[:, None] ** 2)
 
 
 def write_confidence(room: Recording, values: np.ndarray, suffix: str = ".npy") -> None:
@@ -466,22 +447,18 @@ def test_a_confidence_outside_of_0_to_1_is_refused_with_its_file(one_sensor: Rec
 
 
 def test_distances_along_the_ray_become_planar_depth_once(one_sensor: Recording) -> None:
-    truth = one_sensor.depth(ONE, 0)
-    camera = one_sensor.cameras[ONE]
-    distance = np.linalg.norm(back_project(camera, truth) - camera.centre, axis=-1)
+    truth, distance = one_sensor.depth(ONE, 0), along_the_ray(one_sensor)
     assert np.abs(distance / truth - 1).max() > 0.05
-    np.testing.assert_allclose(planar(distance, camera), truth, rtol=1e-5)
     before = prior_of(one_sensor).prior(ONE, 0).depth
-    write_map(one_sensor, distance, {"scale": 1.0, "along": "ray"})
+    write_sensor(showing(one_sensor, {"depth": lambda *_: distance}), {"scale": 1.0, "along": "ray"}, 1.0, ".npy")
     np.testing.assert_allclose(prior_of(one_sensor).prior(ONE, 0).depth, before, rtol=1e-3)
 
 
 def test_metric_maps_may_measure_along_the_ray_and_relative_ones_may_not(tmp_path: Path) -> None:
     room = synthetic_recording(cameras=1, held_out=0, frames=1, width=96, height=54)
-    truth, camera = room.depth(ONE, 0), room.cameras[ONE]
-    distance = np.linalg.norm(back_project(camera, truth) - camera.centre, axis=-1).astype(np.float32)
+    distance = along_the_ray(room).astype(np.float32)
     metric = showing(room, {"mono": lambda *_: distance}, path=tmp_path, mono_kind="metric")
     found = prior_of(metric, PriorSettings(mono_along="ray", hanging_limit=0)).prior(ONE, 0).depth
-    np.testing.assert_allclose(found, truth, rtol=1e-3)
+    np.testing.assert_allclose(found, room.depth(ONE, 0), rtol=1e-3)
     with pytest.raises(D2Error, match="mono_along = ray needs metric maps"):
         prior_of(replace(metric, mono_kind="relative"), PriorSettings(mono_along="ray"))

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from prior_cases import camera_at
 
 from d2_plugin.priors.build import build_priors
 from d2_plugin.priors.cross_view.kernel import BESIDE, LIKE, NEAR, WITHIN
@@ -18,19 +19,13 @@ from d2_plugin.recordings.recording import Camera
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.store.store import PriorStore
 
+pytest.importorskip("cv2")
+
 WIDTH, HEIGHT, WALL, SIGMA = 40, 30, 4.0, 0.05
 TOLERANCE = 0.02
 
 
-def camera(x: float, width: int = WIDTH, height: int = HEIGHT) -> Camera:
-    """At (x, 0, 0), looking along z."""
-    pose = np.eye(4)
-    pose[0, 3] = -x
-    K = np.array([[30.0, 0, width / 2], [0, 30.0, height / 2], [0, 0, 1]])
-    return Camera("camera", width, height, K, pose)
-
-
-CAMERAS = {"left": camera(0.0), "right": camera(0.5)}
+CAMERAS = {name: camera_at((x, 0, 0), size=(WIDTH, HEIGHT), focal=30) for name, x in (("left", 0), ("right", 0.5))}
 
 
 def slanted(view: Camera) -> np.ndarray:
@@ -119,24 +114,6 @@ def test_what_nothing_is_known_of_stays_unknown_however_well_two_maps_agree() ->
     assert np.isinf(compared.sigma).all()
 
 
-def test_only_mono_only_pixels_ever_change() -> None:
-    generator = np.random.default_rng(0)
-    labels = generator.integers(0, len(Label), (HEIGHT, WIDTH)).astype(np.uint8)
-    known = ~np.isin(labels, (Label.EMPTY, Label.CONFLICT))
-    depth = np.where(known, WALL, 0).astype(np.float32)
-    prior = FusedPrior(depth, labels, np.where(known, SIGMA, np.inf).astype(np.float32))
-    for theirs in (prior_of(WALL), prior_of(WALL * 1.01, Label.VERIFIED, 0.001)):
-        compared = left_of(prior, theirs)
-        other = labels != Label.MONO
-        for map_, before in ((compared.depth, depth), (compared.labels, labels), (compared.sigma, prior.sigma)):
-            np.testing.assert_array_equal(map_[other], before[other])
-        changed = compared.labels != labels
-        assert changed.any()
-        assert (labels[changed] == Label.MONO).all()
-        assert (compared.labels[changed] == Label.AGREED).all()
-    np.testing.assert_array_equal(prior.labels, labels)
-
-
 @pytest.mark.parametrize("label", [Label.FAR, Label.AGREED, Label.EMPTY, Label.CONFLICT])
 def test_far_and_empty_pixels_have_no_say_and_agreed_ones_do(label: Label) -> None:
     theirs = prior_of(WALL if label in (Label.FAR, Label.AGREED) else 0.0, label)
@@ -148,18 +125,7 @@ def test_far_and_empty_pixels_have_no_say_and_agreed_ones_do(label: Label) -> No
         np.testing.assert_array_equal(compared.sigma, np.float32(SIGMA))
 
 
-def test_points_behind_another_camera_or_off_its_image_are_not_looked_up() -> None:
-    turned = camera(0.0)
-    turned.T_camera_world[:3, :3] = np.diag([-1.0, 1, -1])  # looks away
-    for there in (turned, camera(1e6), camera(-1e6)):
-        for theirs in (prior_of(WALL), prior_of(WALL, Label.VERIFIED, 0.001)):
-            compared = with_evidence({"left": prior_of(WALL), "away": theirs}, {"left": camera(0), "away": there}, 0.02)
-            assert share(compared["left"], Label.MONO) == 1
-            np.testing.assert_array_equal(compared["left"].sigma, np.float32(SIGMA))
-
-
 def test_cameras_are_compared_for_the_dual_prior_alone(tmp_path: Path) -> None:
-    pytest.importorskip("cv2", reason="opencv is in the `image` extra")
     recording = synthetic_recording(cameras=3, held_out=0, frames=1, width=160, height=90)
     names = list(recording.cameras)
 
@@ -180,7 +146,6 @@ def test_cameras_are_compared_for_the_dual_prior_alone(tmp_path: Path) -> None:
 
 def test_a_surface_of_another_colour_is_not_the_thing_that_the_ray_sees() -> None:
     """A near thing that the map does not know hides what lies behind it from this camera and not from the other."""
-    pytest.importorskip("cv2")
     ours, theirs = prior_of(WALL * 1.01), prior_of(WALL, Label.VERIFIED, 0.001)
     for apart, taken in ((0, True), (0.9, True), (1.1, False)):
         compared = left_of(painted(ours, 100), painted(theirs, 100 + int(apart * LIKE * 255)))
@@ -192,7 +157,6 @@ def test_a_surface_of_another_colour_is_not_the_thing_that_the_ray_sees() -> Non
 @pytest.mark.parametrize(("mine", "seen", "taken"), [(100, 120, True), (100, 100, False), (120, 100, False)])
 def test_a_colour_is_compared_in_the_exposure_of_the_other_camera(mine: int, seen: int, taken: bool) -> None:
     """The left camera verified half of the wall, where the other one shows grey 100 as 120."""
-    pytest.importorskip("cv2")
     mono, verified = prior_of(WALL * 1.01), prior_of(WALL, Label.VERIFIED, 0.001)
     half = np.arange(WIDTH) < WIDTH // 2
     maps = {name: np.where(half, vars(verified)[name], vars(mono)[name]) for name in ("depth", "labels", "sigma")}
@@ -206,7 +170,6 @@ def test_a_colour_is_compared_in_the_exposure_of_the_other_camera(mine: int, see
 
 
 def test_maps_agree_only_about_places_of_one_colour() -> None:
-    pytest.importorskip("cv2")
     maps = {name: painted(prior_of(WALL), grey) for name, grey in (("left", 100), ("right", 130))}
     for prior in with_evidence(maps, CAMERAS, TOLERANCE).values():
         assert share(prior, Label.AGREED) == 0

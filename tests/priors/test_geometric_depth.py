@@ -8,17 +8,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from prior_cases import camera_at
 
 from benchmarks.stereo_rigs import textured_rig
 from d2_plugin.compiler import NoCompiler, find_compiler
 from d2_plugin.errors import D2Error
-from d2_plugin.priors.geometry import (
-    check_depth_range,
-    check_views,
-    pixel_grid,
-    view_pair,
-    viewing_rays,
-)
+from d2_plugin.priors.geometry import check_depth_range, check_views, pixel_grid, view_pair, viewing_rays
 from d2_plugin.priors.settings import StereoSettings
 from d2_plugin.priors.stereo.depth_range import depth_bounds
 from d2_plugin.priors.stereo.filtering.filter import GeometricDepth
@@ -39,7 +34,7 @@ SETTINGS = StereoSettings(matcher="patchmatch")
 @pytest.fixture(scope="module")
 def pair() -> Recording:
     """Two views 10 degrees apart."""
-    return synthetic_recording(cameras=2, held_out=0, frames=1, width=256, height=144, arc_degrees=10)
+    return synthetic_recording(cameras=2, held_out=0, frames=1, width=192, height=108, arc_degrees=10)
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +64,8 @@ def test_a_good_part_of_a_narrow_pair_is_matched(pair: Recording, matched: list[
     assert wrong < 0.02
 
 
-def test_half_resolution_comes_back_at_full_size(pair: Recording) -> None:
+def test_half_resolution_comes_back_at_full_size() -> None:
+    pair = synthetic_recording(cameras=2, held_out=0, frames=1, width=256, height=144, arc_degrees=10)
     results = run(pair, (2.0, 9.0), replace(SETTINGS, max_pixels=128 * 72))
     assert results[0].depth.shape == (144, 256)
     completeness, median, wrong = scores(results, pair)
@@ -146,7 +142,7 @@ def test_the_range_from_triangulated_points_holds_what_two_views_see() -> None:
     pytest.importorskip("pycolmap")
     from d2_plugin.priors.colmap.points import triangulate
 
-    rig = textured_rig(2)
+    rig = textured_rig(2, 240, 135)
     bounds = depth_bounds(rig.cameras, triangulate(rig.images, rig.cameras).positions)
     truth = np.concatenate([depth[seen] for depth, seen in zip(rig.truths, rig.covisible)])
     assert np.mean((truth < bounds.near) | (truth > bounds.far)) < 1e-3
@@ -163,11 +159,13 @@ def test_cameras_that_look_at_each_other_across_a_room_have_a_range_that_holds_i
     assert bounds.far > truth.max()
 
 
-def test_points_behind_or_beside_the_camera_do_not_count(pair: Recording) -> None:
+def test_points_behind_the_camera_do_not_count_and_cameras_at_one_point_have_no_range(pair: Recording) -> None:
     cameras = list(pair.cameras.values())
     backwards = -5 * cameras[0].T_camera_world[2, :3]
     behind = cameras[0].centre + backwards + np.random.default_rng(0).normal(0, 0.1, (200, 3))
     assert "triangulated" not in depth_bounds(cameras, behind).origin
+    with pytest.raises(D2Error, match="stand at one point"):
+        depth_bounds([replace(cameras[0], near_far=None)] * 2)
 
 
 BOUNDS = (2.0, 9.0)
@@ -219,20 +217,10 @@ def test_one_black_image_neither_has_depth_nor_takes_it_from_the_others(views: t
     assert (results[0].depth > 0).mean() > 0.5 * (whole[0].depth > 0).mean()
 
 
-def test_no_depth_range_follows_from_cameras_at_one_point(views: tuple) -> None:
-    first = replace(views[1][0], near_far=None)
-    with pytest.raises(D2Error, match="stand at one point"):
-        depth_bounds([first, replace(first, name="again")])
-
-
-def camera(name: str = "a", x: float = 0.0, turn: float = 0.0, width: int = 64, height: int = 48) -> Camera:
-    """A camera at (x, 0, 0), turned about the vertical by `turn` radians."""
+def uneven(x: float = 0, turn: float = 0) -> Camera:
+    """A camera at (x, 0, 0) whose pixels are no squares."""
     K = np.array([[60.0, 0, 30.5], [0, 58.0, 24.5], [0, 0, 1]])
-    cosine, sine = np.cos(turn), np.sin(turn)
-    T = np.eye(4)
-    T[:3, :3] = [[cosine, 0, -sine], [0, 1, 0], [sine, 0, cosine]]
-    T[:3, 3] = -T[:3, :3] @ [x, 0, 0]
-    return Camera(name, width, height, K, T)
+    return replace(camera_at((x, 0, 0), turn, size=(64, 48)), K=K)
 
 
 @settings(max_examples=50, deadline=None)
@@ -240,7 +228,7 @@ def camera(name: str = "a", x: float = 0.0, turn: float = 0.0, width: int = 64, 
 def test_a_projection_agrees_with_world_points_and_half_pixel_centres(
     u: float, v: float, depth: float, x: float, turn: float
 ) -> None:
-    reference, source = camera(), camera("b", x, turn)
+    reference, source = uneven(), uneven(x, turn)
     at = view_pair(reference, source).project(np.array([u]), np.array([v]), np.array([depth]))
     # Index u has its centre at u + 0.5 in the recording's pixel coordinates.
     local = np.linalg.inv(reference.K) @ [u + 0.5, v + 0.5, 1] * depth
@@ -259,17 +247,17 @@ def test_an_impossible_depth_range_is_refused(bounds: tuple[float, float]) -> No
 
 
 def test_images_that_do_not_belong_to_the_cameras_are_refused() -> None:
-    image = np.zeros((48, 64, 3), np.uint8)
+    image, pair = np.zeros((48, 64, 3), np.uint8), [uneven(), replace(uneven(1), name="b")]
     with pytest.raises(D2Error, match="one image per camera"):
-        check_views([image], [camera(), camera("b", 1)])
+        check_views([image], pair)
     with pytest.raises(D2Error, match="at least 2 cameras"):
-        check_views([image], [camera()])
+        check_views([image], pair[:1])
     with pytest.raises(D2Error, match="camera b is 32x24 pixels"):
-        check_views([image, image[::2, ::2]], [camera(), camera("b", 1)])
+        check_views([image, image[::2, ::2]], pair)
 
 
 def test_the_ray_of_a_pixel_projects_back_to_it_even_where_the_axes_are_skewed() -> None:
-    view = camera()
+    view = uneven()
     view.K[0, 1] = 3.0
     rays = viewing_rays(view, np.float64)
     u, v = pixel_grid(view, np.float64)

@@ -134,10 +134,12 @@ def test_many_sources_and_scattered_pixels(backend: None, rig: Rig) -> None:
         cameras.append(replace(camera, name=str(number), T_camera_world=pose))
     settings = replace(SETTINGS, patchmatch_sources=7, max_angle=170.0, min_angle=1e-4)
     wanted = [np.random.default_rng(number).random(image.shape) < 0.1 for number, image in enumerate(images)]
-    for mask in wanted:
+    for mask in wanted[:3]:
         mask[0], mask[:, -1] = True, True
+    for mask in wanted[3:]:
+        mask[:] = False
     for depth_range in (rig.depth_range, (1e-3, 1e5)):  # the second one draws planes that leave most sources
-        assert max(len(choose_sources(n, cameras, depth_range, settings)) for n in range(10)) == 7
+        assert max(len(choose_sources(n, cameras, depth_range, settings)) for n in range(3)) == 7
         on_both(images, cameras, depth_range, settings, wanted)
 
 

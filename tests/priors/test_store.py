@@ -93,8 +93,6 @@ def test_sigma_above_one_is_infinite_and_only_an_exact_zero_is_zero() -> None:
     sigma = np.array([0.0, 1e-9, 1e-4, 0.5, 1.0, 1.01, 1e9, np.inf], np.float32)
     found = SIGMA[encode_sigma(sigma)]
     np.testing.assert_allclose(found, [0, 1e-4, 1e-4, 0.5, 1, np.inf, np.inf, np.inf], rtol=0.02)
-    every = SIGMA[encode_sigma(SIGMA)]
-    np.testing.assert_array_equal(every, SIGMA)
 
 
 def with_pixel(map_: str, value: float) -> FusedPrior:
@@ -149,16 +147,6 @@ def test_what_is_damaged_is_named_on_open(store: PriorStore, part: str, kept: in
         assert not store.is_current("a", 0, "k")
 
 
-def test_a_flipped_bit_is_found_when_the_map_is_read(store: PriorStore) -> None:
-    data = bytearray(array_file(store).read_bytes())
-    data[-7] ^= 1
-    array_file(store).write_bytes(data)
-    opened = PriorStore.open(store.path)  # headers are intact
-    with pytest.raises(D2Error, match="checksum"):
-        opened.prior("a", 0)
-    assert not opened.is_current("a", 0, "k")
-
-
 @pytest.mark.parametrize("part", [".npy", ".json"])
 def test_what_is_damaged_can_be_read_around_while_it_is_built_again(store: PriorStore, part: str) -> None:
     path = array_file(store, "b").with_suffix(part)
@@ -171,18 +159,16 @@ def test_what_is_damaged_can_be_read_around_while_it_is_built_again(store: Prior
         assert reader.prior("a", 0) is not None
 
 
-def test_an_array_whose_record_was_not_written_yet_does_not_exist(store: PriorStore) -> None:
+def test_an_array_whose_record_was_not_written_yet_is_not_trusted(store: PriorStore) -> None:
     assert store.is_current("a", 0, "k")
     assert not store.is_current("a", 0, "other")
-    array_file(store).with_suffix(".json").unlink()
-    assert PriorStore.open(store.path).prior("a", 0) is None
-    assert not store.is_current("a", 0, "k")
-
-
-def test_an_array_replaced_without_its_record_is_not_trusted(store: PriorStore) -> None:
-    record = array_file(store).with_suffix(".json").read_text()
+    record = array_file(store).with_suffix(".json")
+    before = record.read_text()
     store.write("a", 0, some_prior(5), {"key": "k2"})
-    array_file(store).with_suffix(".json").write_text(record)  # as a kill between the two writes leaves it
+    record.write_text(before)  # as a kill between the two writes leaves it
+    assert not store.is_current("a", 0, "k")
+    record.unlink()
+    assert PriorStore.open(store.path).prior("a", 0) is None
     assert not store.is_current("a", 0, "k")
 
 
@@ -240,11 +226,10 @@ def built(recording: Recording, folder: Path, names: list[str] = NAMES) -> Prior
     return build_priors(recording, names, folder, SETTINGS)
 
 
-def moved(recording: Recording, name: str) -> Recording:
-    camera = recording.cameras[name]
-    pose = camera.T_camera_world.copy()
-    pose[0, 3] += 0.01
-    return replace(recording, cameras={**recording.cameras, name: replace(camera, T_camera_world=pose)})
+def moved(recording: Recording) -> Recording:
+    camera = recording.cameras["train1"]
+    pose = camera.T_camera_world + 0.01 * np.eye(4, k=3)
+    return replace(recording, cameras={**recording.cameras, "train1": replace(camera, T_camera_world=pose)})
 
 
 @pytest.mark.parametrize("other", ["images", "a pose", "a size", "a rig"])
@@ -252,7 +237,7 @@ def test_another_recording_of_the_same_name_changes_no_byte(recording: Recording
     before = contents(copied)
     others = {
         "images": lambda: room(seed=5),
-        "a pose": lambda: moved(recording, "train1"),
+        "a pose": lambda: moved(recording),
         "a size": lambda: room(width=48, height=27),
         "a rig": lambda: room(arc_degrees=30),
     }
