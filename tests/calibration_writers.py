@@ -7,7 +7,7 @@ Everything goes by way of OpenCV's conventions: pixels whose centres lie at whol
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -57,6 +57,39 @@ def rig(
     return found
 
 
+def pose_of(camera: Known) -> np.ndarray:
+    """World to camera [4, 4]."""
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = camera.R, camera.t
+    return pose
+
+
+def corner_pinhole(camera: Known) -> list[float]:
+    """fx, fy, cx, cy where the centre of the first pixel lies at a half."""
+    return [camera.K[0, 0], camera.K[1, 1], camera.K[0, 2] + 0.5, camera.K[1, 2] + 0.5]
+
+
+def in_first_camera(cameras: Sequence[Known]) -> list[Known]:
+    """The same rig in a world that is the first camera's."""
+    poses = [pose_of(camera) @ np.linalg.inv(pose_of(cameras[0])) for camera in cameras]
+    return [camera._replace(R=pose[:3, :3], t=pose[:3, 3]) for camera, pose in zip(cameras, poses, strict=True)]
+
+
+def opencv_storage(path: Path, entries: Mapping[str, Any]) -> Path:
+    """A file that OpenCV writes, YAML or XML by its suffix; a list is a sequence."""
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    for name, value in entries.items():
+        if isinstance(value, list):
+            storage.startWriteStruct(name, cv2.FileNode_SEQ)
+            for item in value:
+                storage.write("", item)
+            storage.endWriteStruct()
+        else:
+            storage.write(name, value)
+    storage.release()
+    return path
+
+
 def toml(file: str, prefix: str = "", metadata: str = "", matrix: bool = False) -> Writer:
     """Writes Pose2Sim's, Anipose's and Caliscope's tables."""
 
@@ -83,31 +116,22 @@ old_caliscope = toml("config.toml", prefix="cameras.", matrix=True)
 
 
 def easymocap(path: Path, cameras: Sequence[Known]) -> Path:
-    files = {name: cv2.FileStorage(str(path / f"{name}.yml"), cv2.FILE_STORAGE_WRITE) for name in ("intri", "extri")}
-    for file in files.values():
-        file.startWriteStruct("names", cv2.FileNode_SEQ)
-        for camera in cameras:
-            file.write("", camera.name)
-        file.endWriteStruct()
+    names = [camera.name for camera in cameras]
+    lenses: dict[str, Any] = {"names": names}
+    poses: dict[str, Any] = {"names": names}
     for camera in cameras:
-        files["intri"].write(f"K_{camera.name}", camera.K)
-        files["intri"].write(f"dist_{camera.name}", np.array([camera.distortion]))
-        files["intri"].write(f"W_{camera.name}", camera.size[0])
-        files["intri"].write(f"H_{camera.name}", camera.size[1])
-        files["extri"].write(f"R_{camera.name}", cv2.Rodrigues(camera.R)[0])
-        files["extri"].write(f"Rot_{camera.name}", camera.R)
-        files["extri"].write(f"T_{camera.name}", camera.t[:, None])
-    for file in files.values():
-        file.release()
+        lenses |= {f"K_{camera.name}": camera.K, f"dist_{camera.name}": np.array([camera.distortion])}
+        lenses |= {f"W_{camera.name}": camera.size[0], f"H_{camera.name}": camera.size[1]}
+        poses |= {f"R_{camera.name}": cv2.Rodrigues(camera.R)[0], f"Rot_{camera.name}": camera.R}
+        poses[f"T_{camera.name}"] = camera.t[:, None]
+    opencv_storage(path / "intri.yml", lenses)
+    opencv_storage(path / "extri.yml", poses)
     return path
 
 
 def kalibr(path: Path, cameras: Sequence[Known]) -> Path:
     content: dict[str, Any] = {}
-    before = np.eye(4)
     for number, camera in enumerate(cameras):
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = camera.R, camera.t
         entry: dict[str, Any] = {
             "cam_overlaps": [other for other in range(len(cameras)) if other != number],
             "camera_model": "pinhole",
@@ -118,9 +142,8 @@ def kalibr(path: Path, cameras: Sequence[Known]) -> Path:
             "rostopic": f"/cam{number}/image_raw",
         }
         if number:
-            entry["T_cn_cnm1"] = (pose @ np.linalg.inv(before)).tolist()
+            entry["T_cn_cnm1"] = (pose_of(camera) @ np.linalg.inv(pose_of(cameras[number - 1]))).tolist()
         content[f"cam{number}"] = json.loads(json.dumps(entry))
-        before = pose
     (path / "camchain.yaml").write_text(yaml.safe_dump(content))
     return path / "camchain.yaml"
 
@@ -182,132 +205,109 @@ def opencv_many(file: str) -> Writer:
     """Writes what the multi-camera calibration of OpenCV's ccalib writes."""
 
     def write(path: Path, cameras: Sequence[Known]) -> Path:
-        storage = cv2.FileStorage(str(path / file), cv2.FILE_STORAGE_WRITE)
-        storage.write("nCameras", len(cameras))
-        for number, camera in enumerate(cameras):
-            R = camera.R @ cameras[0].R.T
-            pose = np.eye(4)
-            pose[:3, :3], pose[:3, 3] = R, camera.t - R @ cameras[0].t
-            storage.write(f"camera_matrix_{number}", camera.K)
-            storage.write(f"camera_distortion_{number}", np.array([camera.distortion]))
-            storage.write(f"camera_pose_{number}", pose)
-        storage.write("meanReprojectError", 0.3)
-        storage.release()
-        return path / file
+        entries: dict[str, Any] = {"nCameras": len(cameras)}
+        for number, camera in enumerate(in_first_camera(cameras)):
+            entries |= {
+                f"camera_matrix_{number}": camera.K,
+                f"camera_distortion_{number}": np.array([camera.distortion]),
+                f"camera_pose_{number}": pose_of(camera),
+            }
+        return opencv_storage(path / file, entries | {"meanReprojectError": 0.3})
 
     return write
 
 
 def opencv_stereo(path: Path, cameras: Sequence[Known]) -> Path:
     """What OpenCV's `stereo_calib` writes of the first two cameras."""
-    files = [
-        cv2.FileStorage(str(path / f"{name}.xml"), cv2.FILE_STORAGE_WRITE) for name in ("intrinsics", "extrinsics")
-    ]
-    one, other = cameras[:2]
-    for number, camera in enumerate((one, other), start=1):
-        files[0].write(f"M{number}", camera.K)
-        files[0].write(f"D{number}", np.array([camera.distortion]))
-    R = other.R @ one.R.T
-    files[1].write("R", R)
-    files[1].write("T", (other.t - R @ one.t)[:, None])
-    files[1].write("Q", np.eye(4))
-    for file in files:
-        file.release()
-    return path / "intrinsics.xml"
+    lenses: dict[str, Any] = {}
+    for number, camera in enumerate(cameras[:2], start=1):
+        lenses |= {f"M{number}": camera.K, f"D{number}": np.array([camera.distortion])}
+    other = in_first_camera(cameras)[1]
+    opencv_storage(path / "extrinsics.xml", {"R": other.R, "T": other.t[:, None], "Q": np.eye(4)})
+    return opencv_storage(path / "intrinsics.xml", lenses)
 
 
 def transforms(path: Path, cameras: Sequence[Known]) -> Path:
-    flip = np.diag([1.0, -1, -1])
+    flip = np.diag([1.0, -1, -1, 1])
     frames = []
     for camera in cameras:
-        matrix = np.eye(4)
-        matrix[:3, :3], matrix[:3, 3] = camera.R.T @ flip, -camera.R.T @ camera.t
-        k1, k2, p1, p2, k3 = camera.distortion
-        frames.append(
-            {"file_path": f"images/{camera.name}/000000.png", "transform_matrix": matrix.tolist(), "w": camera.size[0],
-             "h": camera.size[1], "fl_x": camera.K[0, 0], "fl_y": camera.K[1, 1], "cx": camera.K[0, 2] + 0.5,
-             "cy": camera.K[1, 2] + 0.5, "k1": k1, "k2": k2, "p1": p1, "p2": p2, "k3": k3, "camera_label": camera.name}
-        )  # fmt: skip
+        entry: dict[str, Any] = {"file_path": f"images/{camera.name}/000000.png", "camera_label": camera.name}
+        entry |= {"transform_matrix": (np.linalg.inv(pose_of(camera)) @ flip).tolist()}
+        entry |= dict(zip(("w", "h"), camera.size, strict=True))
+        entry |= dict(zip(("fl_x", "fl_y", "cx", "cy"), corner_pinhole(camera), strict=True))
+        entry |= dict(zip(("k1", "k2", "p1", "p2", "k3"), camera.distortion, strict=True))
+        frames.append(entry)
     (path / "transforms.json").write_text(json.dumps({"camera_model": "OPENCV", "frames": frames}))
     return path / "transforms.json"
 
 
 def cameras_json(path: Path, cameras: Sequence[Known]) -> Path:
-    entries = [
-        {"name": camera.name, "width": camera.size[0], "height": camera.size[1], "fx": camera.K[0, 0],
-         "fy": camera.K[1, 1], "cx": camera.K[0, 2] + 0.5, "cy": camera.K[1, 2] + 0.5, "R": camera.R.tolist(),
-         "t": camera.t.tolist(), "model": "fisheye" if camera.fisheye else "opencv", "distortion": camera.distortion}
-        for camera in cameras
-    ]  # fmt: skip
+    entries = []
+    for camera in cameras:
+        entry: dict[str, Any] = {"name": camera.name, "R": camera.R.tolist(), "t": camera.t.tolist()}
+        entry |= {"model": "fisheye" if camera.fisheye else "opencv", "distortion": camera.distortion}
+        entry |= dict(zip(("width", "height"), camera.size, strict=True))
+        entries.append(entry | dict(zip(("fx", "fy", "cx", "cy"), corner_pinhole(camera), strict=True)))
     (path / "cameras.json").write_text(json.dumps({"cameras": entries}))
     return path / "cameras.json"
 
 
-def _reconstruction(cameras: Sequence[Known], one_rig: bool) -> Any:
-    """A model of pycolmap's own: each camera a rig of its own, or all of them one rig that stands in one frame."""
+def _reconstruction(cameras: Sequence[Known]) -> Any:
+    """A model of pycolmap's own."""
     import pycolmap
 
-    found, poses = pycolmap.Reconstruction(), {}
+    found = pycolmap.Reconstruction()
     for number, camera in enumerate(cameras, start=1):
-        values = [camera.K[0, 0], camera.K[1, 1], camera.K[0, 2] + 0.5, camera.K[1, 2] + 0.5]
         k = (*camera.distortion, 0, 0, 0)[:8]
         model, more = ("OPENCV_FISHEYE", k[:4]) if camera.fisheye else ("FULL_OPENCV", k)
-        found.add_camera(
-            pycolmap.Camera(
-                camera_id=number, model=model, width=camera.size[0], height=camera.size[1], params=[*values, *more]
-            )
-        )
-        poses[number] = pycolmap.Rigid3d(pycolmap.Rotation3d(camera.R), camera.t)
-    sensors = {number: pycolmap.sensor_t(pycolmap.SensorType.CAMERA, number) for number in poses}
-    for rig_id, members in enumerate([list(poses)] if one_rig else [[number] for number in poses], start=1):
-        rig = pycolmap.Rig(rig_id=rig_id)
-        rig.add_ref_sensor(sensors[members[0]])
-        for number in members[1:]:
-            rig.add_sensor(sensors[number], poses[number] * poses[members[0]].inverse())
-        found.add_rig(rig)
-        frame = pycolmap.Frame(frame_id=rig_id, rig_id=rig_id)
-        for number in members:
-            frame.add_data_id(pycolmap.data_t(sensors[number], number))
-        frame.rig_from_world = poses[members[0]]
-        found.add_frame(frame)
-    for number, camera in enumerate(cameras, start=1):
-        frame_id = 1 if one_rig else number
+        width, height = camera.size
+        lens = pycolmap.Camera(model=model, width=width, height=height, camera_id=number)
+        lens.params = [*corner_pinhole(camera), *more]
+        found.add_camera_with_trivial_rig(lens)
         image = pycolmap.Image(name=f"{camera.name}/000000.png", camera_id=number, image_id=number)
-        image.frame_id = frame_id
-        found.add_image(image)
-    for frame_id in list(found.frames):
-        found.register_frame(frame_id)
+        found.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(camera.R), camera.t))
     return found
 
 
 def colmap_binary(path: Path, cameras: Sequence[Known]) -> Path:
     folder = path / "sparse" / "0"
     folder.mkdir(parents=True)
-    _reconstruction(cameras, one_rig=False).write_binary(str(folder))
+    _reconstruction(cameras).write_binary(str(folder))
     return path
 
 
 def colmap_text_of_a_rig(path: Path, cameras: Sequence[Known]) -> Path:
-    _reconstruction(cameras, one_rig=True).write_text(str(path))
+    """All cameras are one rig that stands in one frame."""
+    import pycolmap
+
+    single = _reconstruction(cameras)
+    found, rig, frame = pycolmap.Reconstruction(), pycolmap.Rig(rig_id=1), pycolmap.Frame(frame_id=1, rig_id=1)
+    frame.rig_from_world = single.images[1].cam_from_world()
+    for number, lens in sorted(single.cameras.items()):
+        found.add_camera(lens)
+        if number == 1:
+            rig.add_ref_sensor(lens.sensor_id)
+        else:
+            rig.add_sensor(lens.sensor_id, single.images[number].cam_from_world() * frame.rig_from_world.inverse())
+        frame.add_data_id(pycolmap.data_t(lens.sensor_id, number))
+    found.add_rig(rig)
+    found.add_frame(frame)
+    for number, image in sorted(single.images.items()):
+        found.add_image(pycolmap.Image(name=image.name, camera_id=number, image_id=number, frame_id=1))
+    found.register_frame(1)
+    found.write_text(str(path))
     return path
 
 
 def rig_config(path: Path, cameras: Sequence[Known]) -> Path:
     """COLMAP's rig_config.json: the first camera's axes are the rig's."""
     entries: list[dict[str, Any]] = []
-    for number, camera in enumerate(cameras):
-        R = camera.R @ cameras[0].R.T
-        t = camera.t - R @ cameras[0].t
-        values = [camera.K[0, 0], camera.K[1, 1], camera.K[0, 2] + 0.5, camera.K[1, 2] + 0.5]
-        entry = {"image_prefix": f"rig1/{camera.name}/", "camera_model_name": "FULL_OPENCV"}
-        entry["camera_params"] = [*values, *camera.distortion, *[0] * (8 - len(camera.distortion))]
-        x, y, z, w = Rotation.from_matrix(R).as_quat()
-        entry |= (
-            {"cam_from_rig_rotation": [w, x, y, z], "cam_from_rig_translation": t.tolist()}
-            if number
-            else {"ref_sensor": True}
-        )
-        entries.append(entry)
+    for number, camera in enumerate(in_first_camera(cameras)):
+        entry: dict[str, Any] = {"image_prefix": f"rig1/{camera.name}/", "camera_model_name": "FULL_OPENCV"}
+        entry["camera_params"] = [*corner_pinhole(camera), *camera.distortion, *[0] * (8 - len(camera.distortion))]
+        x, y, z, w = Rotation.from_matrix(camera.R).as_quat()
+        placed = {"cam_from_rig_rotation": [w, x, y, z], "cam_from_rig_translation": camera.t.tolist()}
+        entries.append(entry | (placed if number else {"ref_sensor": True}))
     (path / "rig_config.json").write_text(json.dumps([{"cameras": entries}]))
     return path / "rig_config.json"
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 
@@ -49,7 +49,6 @@ class Filmed:
 
     folder: Path
     calibration: Path
-    shootings: dict[str, Shooting] = field(default_factory=dict)
 
     @property
     def videos(self) -> Path:
@@ -93,7 +92,7 @@ def video(
         )
     calibration = folder / "cameras.json"
     calibration.write_text(json.dumps(described(recording)))
-    return Filmed(folder, calibration, dict(shootings))
+    return Filmed(folder, calibration)
 
 
 def graded(image: np.ndarray, gain: tuple[float, float, float]) -> np.ndarray:
@@ -142,6 +141,19 @@ def write_video(
             for packet in _encoded(av, track, sound):
                 container.mux(packet)
     return path
+
+
+def write_avi(path: Path, images: Sequence[np.ndarray], rate: int, codec: str = "mpeg4", tag: str = "XVID") -> None:
+    """An AVI with B-frames, as Xvid writes it."""
+    av = pytest.importorskip("av")
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(codec, rate=rate)
+        stream.height, stream.width = images[0].shape[:2]
+        stream.pix_fmt, stream.bit_rate, stream.gop_size = "yuv420p", 8_000_000, 12
+        stream.codec_context.max_b_frames, stream.codec_context.codec_tag = 2, tag
+        for image in images:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
+        container.mux(stream.encode())
 
 
 def _encoded(av, track, sound: np.ndarray):

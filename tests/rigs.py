@@ -34,7 +34,7 @@ def arc(cameras: int = 4, degrees: float = 25.0, scale: float = 1.0) -> dict[str
     return found
 
 
-def seen_by(cameras: dict[str, Camera], things: int = 250, wrong: float = 0.15, seed: int = 0) -> dict[str, Features]:
+def seen_by(cameras: dict[str, Camera], things: int = 160, wrong: float = 0.15, seed: int = 0) -> dict[str, Features]:
     """What the cameras see of random things at two moments, as features; a share of them is matched wrongly."""
     rng = np.random.default_rng(seed)
     points = rng.uniform(-1, 1, (2, things, 3))

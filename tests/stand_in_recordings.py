@@ -12,12 +12,8 @@ from prior_cases import MAPS, showing
 
 from d2_plugin.errors import D2Error
 from d2_plugin.recordings import Recording, Source, open_recording
-from d2_plugin.recordings.export.folder import save_recording
 from d2_plugin.recordings.export.n3dv import llff_row
 from d2_plugin.recordings.synthetic.room import synthetic_recording
-
-LLFF_DIGITS = 7
-"""Decimals of the rotations in poses_bounds.npy of the data set: orthonormal up to rounding."""
 
 
 @dataclass(frozen=True)
@@ -72,21 +68,11 @@ def write_videos(recording: Recording, folder: Path) -> Path:
     return write_rows(recording, folder)
 
 
-def write_rows(recording: Recording, folder: Path, digits: int | None = None) -> Path:
-    """poses_bounds.npy of cameras that declare near and far, rounded to `digits` where given."""
-    rows = np.stack([llff_row(camera, camera.near_far or (1.0, 10.0)) for camera in recording.cameras.values()])
-    np.save(folder / "poses_bounds.npy", rows if digits is None else rows.round(digits))
+def write_rows(recording: Recording, folder: Path) -> Path:
+    """poses_bounds.npy of cameras that declare near and far."""
+    rows = [llff_row(camera, camera.near_far or (1.0, 10.0)) for camera in recording.cameras.values()]
+    np.save(folder / "poses_bounds.npy", np.stack(rows))
     return folder
-
-
-def five_cameras(folder: Path) -> Path:
-    """A folder recording of one instant with N3DV's names, its rotations rounded as the data set's are."""
-    recording = smooth_recording(("cam00", "cam03", "cam05", "cam08", "cam14"), frames=1, width=32, height=24)
-    rounded = {
-        name: replace(camera, T_camera_world=camera.T_camera_world.round(LLFF_DIGITS))
-        for name, camera in recording.cameras.items()
-    }
-    return write_rows(recording, save_recording(replace(recording, cameras=rounded), folder), LLFF_DIGITS)
 
 
 def refused(path: Path, pattern: str, **options: object) -> None:

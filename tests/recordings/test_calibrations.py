@@ -15,7 +15,18 @@ import zlib  # noqa: F401  (pycolmap brings a zlib of its own that must not come
 
 pytest.importorskip("pycolmap", reason="pycolmap is in the `calibration` extra")
 
-from calibration_writers import CASES, Known, anipose, cameras_json, easymocap, panoptic, pose2sim, rig, transforms
+from calibration_writers import (
+    CASES,
+    Known,
+    anipose,
+    cameras_json,
+    easymocap,
+    in_first_camera,
+    panoptic,
+    pose2sim,
+    rig,
+    transforms,
+)
 
 from d2_plugin.errors import D2Error
 from d2_plugin.recordings.cameras.calibration import open_calibration
@@ -29,12 +40,6 @@ POINTS = np.random.default_rng(0).uniform(-0.6, 0.6, (200, 3))
 
 def cameras_of(path: Path, sizes: dict[str, tuple[int, int]] | None = None) -> tuple[CalibratedCamera, ...]:
     return open_calibration(path, sizes).cameras
-
-
-def in_first_camera(cameras: list[Known]) -> list[Known]:
-    """The same rig in a world that is the first camera's."""
-    R, t = cameras[0].R, cameras[0].t
-    return [camera._replace(R=camera.R @ R.T, t=camera.t - camera.R @ R.T @ t) for camera in cameras]
 
 
 def assert_same(found: CalibratedCamera, known: Known, points: np.ndarray) -> None:

@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from stand_in_recordings import five_cameras, smooth_recording
+from stand_in_recordings import smooth_recording
 
 from d2_plugin.commands.cli import main
 from d2_plugin.errors import D2Error
@@ -53,7 +53,7 @@ def test_the_unsynchronised_camera_is_neither_trained_on_nor_scored() -> None:
 
 
 def test_a_recording_of_five_cameras_has_a_preset(tmp_path: Path) -> None:
-    path = five_cameras(tmp_path / "scene")  # read as a folder, an N3DV scene by its names
+    path = save_recording(rig(cameras=("cam00", "cam03", "cam05", "cam08", "cam14")), tmp_path / "scene")
     split = camera_split(open_recording(path), "preset:4")
     assert (split.train, split.test) == (("cam03", "cam05", "cam08", "cam14"), ("cam00",))
     assert any("cam01, cam13, cam10, cam20 missing" in note for note in split.notes)

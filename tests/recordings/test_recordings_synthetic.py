@@ -25,16 +25,20 @@ def world_points(camera: Camera, depth: np.ndarray) -> np.ndarray:
     return (in_camera - camera.T_camera_world[:3, 3]) @ camera.T_camera_world[:3, :3]
 
 
+def projected(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Columns, rows and planar depths of world points [n, 3]."""
+    in_camera = points @ camera.T_camera_world[:3, :3].T + camera.T_camera_world[:3, 3]
+    u, v, depth = (in_camera @ camera.K.T).T
+    return u / depth, v / depth, depth
+
+
 def test_depth_says_where_another_camera_sees_the_same_surface(recording: Recording) -> None:
     """Points from one camera's depth, seen by another: never in front of the other's depth, mostly on it."""
     first, second = recording.cameras["train1"], recording.cameras["train2"]
-    points = world_points(first, recording.depth("train1", 2))
-    in_second = points @ second.T_camera_world[:3, :3].T + second.T_camera_world[:3, 3]
-    pixels = in_second @ second.K.T
-    u, v = (pixels[:, :2] / pixels[:, 2:]).T
+    u, v, depth = projected(second, world_points(first, recording.depth("train1", 2)))
     inside = (u >= 1) & (u < second.width - 1) & (v >= 1) & (v < second.height - 1)
     seen = recording.depth("train2", 2)[v[inside].astype(int), u[inside].astype(int)]
-    ratio = in_second[inside, 2] / seen
+    ratio = depth[inside] / seen
     assert np.mean(np.abs(ratio - 1) < 0.02) > 0.8
     assert np.mean(ratio < 0.97) < 0.03  # only at silhouettes, by up to a pixel
 
@@ -45,10 +49,8 @@ def test_what_moves_is_seen_later_where_its_scene_flow_says(recording: Recording
     moves = np.linalg.norm(flow, axis=1) > 1e-6
     assert 0.01 < moves.mean() < 0.3
     moved = (world_points(camera, recording.depth("train1", 0)) + flow)[moves]
-    later = moved @ camera.T_camera_world[:3, :3].T + camera.T_camera_world[:3, 3]
-    pixels = later @ camera.K.T
-    u, v = (pixels[:, :2] / pixels[:, 2:]).T.astype(int)
-    ratio = later[:, 2] / recording.depth("train1", 3)[v, u]
+    u, v, depth = projected(camera, moved)
+    ratio = depth / recording.depth("train1", 3)[v.astype(int), u.astype(int)]
     assert np.mean(np.abs(ratio - 1) < 0.02) > 0.7, "what turns away is not seen any more"
     assert np.mean(ratio < 0.97) < 0.1  # only at silhouettes, by up to a pixel
     np.testing.assert_allclose(scene_flow(recording.source, "train1", 2, 2), 0, atol=1e-6)

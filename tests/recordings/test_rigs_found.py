@@ -46,11 +46,11 @@ class TestFocalLengths:
             name: replace(camera, K=pinhole(600, 600, camera.width / 2, camera.height / 2))
             for name, camera in arc().items()
         }
-        rig = solve_features(seen_by(truth), blind(truth), tuple(truth), focal=focal)
+        rig = solve_features(seen_by(truth, things=250), blind(truth), tuple(truth), focal=focal)
         for name, camera in rig.cameras.items():
             assert camera.K[0, 0] == pytest.approx(600, rel=0.01)
             assert abs(np.log(camera.K[0, 0] / 600)) < max(2 * rig.focals[name], 0.004)
-        assert len({camera.K[0, 0] for camera in rig.cameras.values()}) == (1 if focal == "shared" else 4)
+        assert len({camera.K[0, 0] for camera in rig.cameras.values()}) == (1 if focal == "shared" else len(truth))
         assert worst(rig.cameras, truth)[0] < 0.3
         assert "focal length 60" in rig.verdicts()["c0"] or "focal length 59" in rig.verdicts()["c0"]
 
@@ -75,7 +75,7 @@ class TestBoards:
     @pytest.mark.parametrize("size", [(8, 6), (8, 5)])
     def test_a_plain_board_that_some_see_the_other_way_up_settles_the_rig_and_its_scale(self, size) -> None:
         truth = arc(3, 40.0, 0.5)
-        images, board = held(truth, 0.2, 6, plain=size)
+        images, board = held(truth, 0.2, 5, plain=size)
         images["c1"] = [np.ascontiguousarray(image[::-1, ::-1]) for image in images["c1"]]  # hung upside down
         K = truth["c1"].K * [[1, 1, -1], [1, 1, -1], [1, 1, 1]] + [[0, 0, 320], [0, 0, 240], [0, 0, 0]]
         over = np.diag([-1.0, -1, 1, 1])
@@ -86,7 +86,7 @@ class TestBoards:
         assert share < 0.003
         scaled = scaled_by_board(rig, images, board)
         assert rig_width(scaled.cameras.values()) == pytest.approx(rig_width(truth.values()), rel=0.005)
-        assert "the board was seen by c0 in 6 of 6 images, c1 in" in scaled.scale
+        assert "the board was seen by c0 in 5 of 5 images, c1 in" in scaled.scale
 
     def test_half_of_a_charuco_board_is_enough_for_the_scale_and_half_of_a_plain_one_is_not(self) -> None:
         truth = arc(3)

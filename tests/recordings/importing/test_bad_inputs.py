@@ -117,16 +117,9 @@ def flipped(cameras: dict[str, Any]) -> None:
         camera.update(R=(np.array(camera["R"]) @ np.diag([1.0, 1.0, -1.0])).tolist())
 
 
-def of_another_rig(given: Filmed) -> None:
-    """A calibration of cameras with the same names and sizes, which stood wider apart."""
-
-    def edit(cameras: dict[str, Any]) -> None:
-        for angle, name in zip((-0.35, 0.0, 0.35), NAMES):
-            cosine, sine = np.cos(angle), np.sin(angle)
-            R = np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]])
-            cameras[name].update(R=R.tolist(), t=[0.1, 0.05, 4.0])
-
-    change(given, edit)
+def zoomed(cameras: dict[str, Any]) -> None:
+    """A focal length that one camera did not have."""
+    cameras["03"].update(fx=3 * cameras["03"]["fx"], fy=3 * cameras["03"]["fy"])
 
 
 def called_alike(given: Filmed) -> None:
@@ -143,11 +136,7 @@ CASES: list[tuple[Callable[[Filmed], object], list[str], str]] = [
     (called_alike, [], r"are both called 03: name each video like its camera"),
     (swap, [], r"cameras 02 and 04 are swapped: exchange"),
     (edited(lambda c: c["03"].update(R=(np.diag([-1, 1, -1]) @ c["03"]["R"]).tolist())), ["--offsets", "none"], r"03"),
-    (
-        edited(lambda c: c["03"].update(fx=3 * c["03"]["fx"], fy=3 * c["03"]["fy"])),
-        [],
-        r"does not fit the videos: .*03",
-    ),
+    (edited(zoomed), [], r"does not fit the videos: .*03.*; or give --accept-calibration"),
     (edited(flipped), [], r"camera 02 .*mirrored.*right-handed"),
     (
         edited(lambda c: [c[name].update(t=[1000 * value for value in c[name]["t"]]) for name in NAMES]),
@@ -161,17 +150,13 @@ CASES: list[tuple[Callable[[Filmed], object], list[str], str]] = [
     ),
     (edited(lambda c: c["03"].update(R=c["02"]["R"], t=c["02"]["t"])), [], r"cameras 02 and 03 the identical pose"),
     (overwritten("cameras.json", b"<?xml version='1.0'?><calibration/>"), [], r"\(qualisys\) describes no camera"),
-    (overwritten("cameras.json", b"<?xml version='1.0'?><opencv_storage/>"), [], r"is no calibration that can be read"),
     (overwritten("cameras.json", b"<!DOCTYPE a [<!ENTITY b 'c'>]><calibration/>"), [], r"declares entities"),
     (lambda given: None, ["--offsets", "07=3"], r"--offsets names camera '07', have 02, 03, 04"),
     (lambda given: None, ["--offsets", "03=soon"], r"--offsets says '03=soon', expected auto, .* or NAME=FRAMES"),
-    (lambda given: None, ["--offsets", "03=900"], r"camera 0\d stopped .* seconds before camera 03 began"),
     (lambda given: None, ["--offsets", "timecode"], r"nothing in the timecode links"),
     (lambda given: None, ["--crop", "9000x10+0+0"], r"lies outside of camera 02, which has"),
     (lambda given: None, ["--crop", "all of it"], r"--crop says 'all of it', expected WIDTHxHEIGHT\+LEFT\+TOP"),
-    (lambda given: None, ["--crop", "09=10x10+0+0"], r"--crop names camera '09', have 02, 03, 04"),
     (lambda given: None, ["--scale", "0.001"], r"--scale 0.001 leaves less than 8 pixels"),
-    (lambda given: None, ["--scale", "0"], r"scale"),
 ]
 
 
@@ -213,13 +198,9 @@ def test_another_import_and_another_folder_are_not_written_over(
     assert [path.name for path in (tmp_path / "mine").iterdir()] == ["thesis.txt"]
 
 
-def test_who_knows_better_imports_all_the_same(given: Filmed, tmp_path: Path, capsys) -> None:
-    of_another_rig(given)
+def test_who_knows_better_imports_all_the_same(given: Filmed, tmp_path: Path) -> None:
+    change(given, zoomed)
     words = importing(given, tmp_path / "c", "--offsets", "none", "--frames", "0:1", "--images", "videos")
-    assert main(words) == 2
-    said = capsys.readouterr().err
-    assert "does not fit the videos: " in said
-    assert "or give --accept-calibration" in said
     assert main([*words, "--accept-calibration"]) == 0
     assert any("misses features" in note for note in open_recording(tmp_path / "c").notes)
 
