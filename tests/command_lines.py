@@ -1,4 +1,4 @@
-"""Command lines that are refused."""
+"""Command lines that are refused, and the forms that read them."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ import re
 
 import pytest
 
-from d2_plugin.commands.cli import main
+from d2_plugin.commands.arguments.form import Form, ModuleCommand
+from d2_plugin.commands.cli import COMMANDS, _module, main
 
 
 def refused(capsys: pytest.CaptureFixture[str], *words: object) -> str:
@@ -19,3 +20,9 @@ def refused(capsys: pytest.CaptureFixture[str], *words: object) -> str:
     assert lines[0].startswith("d2: "), lines
     assert "unexpected" not in lines[0], lines
     return lines[0]
+
+
+def form_of(command: str, words: list[str]) -> Form:
+    """What reads the words behind a command; some commands look at the words first."""
+    known = COMMANDS[command]
+    return known.form(f"d2 {command}") if isinstance(known, ModuleCommand) else _module(known).form(words)

@@ -10,7 +10,6 @@ from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 
 import pytest
-from small_layouts import write_layout
 
 from d2_plugin.commands import cli
 from d2_plugin.commands.arguments import boundary
@@ -18,19 +17,12 @@ from d2_plugin.commands.arguments.boundary import one_line, sentence
 from d2_plugin.commands.cli import main
 from d2_plugin.errors import D2Error
 
-pytest.importorskip("cv2", reason="opencv is in the `image` extra")
-
 Refused = Callable[..., str]
 
 
-@pytest.fixture(scope="module")
-def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_layout("folder", tmp_path_factory.mktemp("recording") / "small")
-
-
 @pytest.fixture
-def copy(recording: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(recording, tmp_path / "copy"))
+def copy(small: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(small, tmp_path / "copy"))
 
 
 class TestTheBoundary:
@@ -118,9 +110,9 @@ class TestWords:
         ],
     )
     def test_values_that_cannot_be(
-        self, recording: Path, tmp_path: Path, refused: Refused, words: list[str], says: str
+        self, small: Path, tmp_path: Path, refused: Refused, words: list[str], says: str
     ) -> None:
-        fixed = ["train", str(recording), "--train-cameras", "cam00", "--output", str(tmp_path / "x")]
+        fixed = ["train", str(small), "--train-cameras", "cam00", "--output", str(tmp_path / "x")]
         assert says in refused(*fixed, *words)
         assert not (tmp_path / "x").exists()
 
@@ -134,27 +126,25 @@ class TestWords:
             "[plan]\nverification = false",
         ],
     )  # fmt: skip
-    def test_configurations_that_cannot_be(self, recording: Path, tmp_path: Path, refused: Refused, text: str) -> None:
+    def test_configurations_that_cannot_be(self, small: Path, tmp_path: Path, refused: Refused, text: str) -> None:
         (tmp_path / "d2.toml").write_text(text)
-        refused("plan", str(recording), "--train-cameras", "cam00", "--config", str(tmp_path / "d2.toml"))
+        refused("plan", str(small), "--train-cameras", "cam00", "--config", str(tmp_path / "d2.toml"))
 
 
 class TestPlaces:
     """Files, folders and other things where the other is expected."""
 
-    def test_a_configuration_that_is_a_pipe_or_a_folder(
-        self, recording: Path, tmp_path: Path, refused: Refused
-    ) -> None:
+    def test_a_configuration_that_is_a_pipe_or_a_folder(self, small: Path, tmp_path: Path, refused: Refused) -> None:
         os.mkfifo(tmp_path / "pipe.toml")
-        plan = ["plan", str(recording), "--train-cameras", "cam00", "--config"]
+        plan = ["plan", str(small), "--train-cameras", "cam00", "--config"]
         assert "is a pipe, expected a file" in refused(*plan, str(tmp_path / "pipe.toml"))
         assert "is a folder, expected a file" in refused(*plan, str(tmp_path))
         assert "no configuration at" in refused(*plan, str(tmp_path / "none.toml"))
 
     @pytest.mark.parametrize("output", ["file", "file/below", "x" * 300, "a/" + "y" * 5000])
-    def test_an_output_that_cannot_be(self, recording: Path, tmp_path: Path, refused: Refused, output: str) -> None:
+    def test_an_output_that_cannot_be(self, small: Path, tmp_path: Path, refused: Refused, output: str) -> None:
         (tmp_path / "file").write_text("mine")
-        words = ["train", str(recording), "--train-cameras", "cam00", "--hooks", "none", "--iterations", "1"]
+        words = ["train", str(small), "--train-cameras", "cam00", "--hooks", "none", "--iterations", "1"]
         refused(*words, "--output", str(tmp_path / output))
         assert (tmp_path / "file").read_text() == "mine"
 

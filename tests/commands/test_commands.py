@@ -10,20 +10,18 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from command_lines import form_of
+from stand_in_recordings import renamed
 
-from d2_plugin.commands import cli
-from d2_plugin.commands.arguments.form import Form, Given, ModuleCommand
+from d2_plugin.commands.arguments.form import Given
 from d2_plugin.commands.cli import COMMANDS, main
 from d2_plugin.config import DensifyConfig
+from d2_plugin.recordings.export.folder import save_recording
+from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.runs.run import Run
 from d2_plugin.runs.settings import hook_config, prior_settings
 
 CAMERAS = ["--train-cameras", "train0,train1,train2"]
-
-
-def form_of(command: str, words: list[str]) -> Form:
-    known = COMMANDS[command]
-    return known.form(command) if isinstance(known, ModuleCommand) else cli._module(known).form(words)
 
 
 def parsed(command: str, *words: str) -> Given:
@@ -118,18 +116,10 @@ class TestTables:
 
 
 def test_a_preset_passes_over_a_camera_without_calibration_and_so_does_the_run(
-    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    room = tmp_path / "room"
-    shutil.copytree(recording, room)
-    names = {"train0": "cam01", "train1": "cam13", "train2": "cam10", "test0": "cam00"}
-    for kind in ("images", "depth", "mono"):
-        for old, new in names.items():
-            (room / kind / old).rename(room / kind / new)
-    description = (room / "cameras.json").read_text()
-    for old, new in names.items():
-        description = description.replace(f'"{old}"', f'"{new}"')
-    (room / "cameras.json").write_text(description)
+    rendered = synthetic_recording(cameras=3, held_out=1, frames=2, width=48, height=27)
+    room = save_recording(renamed(rendered, ("cam01", "cam13", "cam10", "cam00")), tmp_path / "room")
     shutil.copytree(room / "images" / "cam01", room / "images" / "cam07")  # images without calibration
     words = ["--train-cameras", "preset:2", "--iterations", "4", "--hooks", "none", "--output", str(tmp_path / "run")]
     assert main(["train", str(room), *words]) == 0

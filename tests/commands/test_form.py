@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import pytest
 
@@ -167,13 +167,3 @@ class TestHelp:
         assert "--no-images Less. --" not in text
         assert "--output PATH Where it goes. (needed)" in text
         assert "(above 0)" in help_text(form_of(Unions), ["--help"])
-
-    def test_an_unknown_table_is_answered_with_the_nearest(self) -> None:
-        with pytest.raises(D2Error, match="did you mean 'prune'"):
-            help_text(form_of(), ["--help", "prunes"])
-
-
-def test_a_setting_may_be_written_in_a_way_of_its_own() -> None:
-    readers: dict[str, Any] = {"sizes": lambda text: (7,) if text == "all" else ()}
-    form = Form("d2 work", "", declared(Unions), lambda given: None, readers=readers)
-    assert form.parse(["--sizes", "all"]).values["sizes"] == (7,)

@@ -11,28 +11,20 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from command_lines import form_of
 from fuzzing import ODD_TEXTS, ODD_VALUES, SEED, bounded_memory, mutate_file
-from small_layouts import write_layout
 
-from d2_plugin.commands.arguments.form import ModuleCommand
 from d2_plugin.commands.arguments.text import flag_of
-from d2_plugin.commands.cli import COMMANDS, _module, main
+from d2_plugin.commands.cli import COMMANDS, main
 from d2_plugin.config import for_iterations
 
-pytest.importorskip("cv2", reason="opencv is in the `image` extra")
-
-FEW, MANY = 60, 2000
+ROUNDS = [(60, 0), pytest.param(2000, SEED, marks=pytest.mark.slow)]
 
 
-@pytest.fixture(scope="module")
-def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_layout("folder", tmp_path_factory.mktemp("recording") / "small")
-
-
-def random_words(rng: random.Random, recording: Path, output: Path) -> list[str]:
+def random_words(rng: random.Random, small: Path, output: Path) -> list[str]:
     """A command line that a person might have meant, with a few words replaced."""
     command = rng.choice([name for name in COMMANDS if name not in ("demo", "bench", "doctor", "ablate")])
-    words = [command, str(recording), "--train-cameras", "cam00,cam01", "--output", str(output), "--iterations", "1"]
+    words = [command, str(small), "--train-cameras", "cam00,cam01", "--output", str(output), "--iterations", "1"]
     flags = ("seed", "frames", "downscale", "hooks", "config", "mono-onnx", "mono-kind", "test-cameras", "shard")
     tables = ("densify.spacing", "prune.tau-p", "priors.stereo.min-angle", "plan.temporal", "backbone.sh-degree")
     odd = [str(value) for value in ODD_VALUES] + list(ODD_TEXTS) + ["preset:4", "1/0", "cam00", "none", "all", "true"]
@@ -67,20 +59,20 @@ def expect_an_answer(words: list[str], capsys: pytest.CaptureFixture[str], seed:
     assert len(lines) == (1 if code else 0), (seed, words, captured.err)
 
 
-def fuzz_words(count: int, seed: int, recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def fuzz_words(count: int, seed: int, small: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Run mutated command lines; what would work for long is refused beforehand, by a place that cannot be written."""
     (tmp_path / "file").write_text("in the way of every output")
     with bounded_memory():
         for number in range(count):
             rng = random.Random(f"words {seed} {number}")
-            words = random_words(rng, recording, tmp_path / "file" / "out")
+            words = random_words(rng, small, tmp_path / "file" / "out")
             expect_an_answer(words, capsys, f"words {seed} {number}")
 
 
-def fuzz_configurations(
-    count: int, seed: int, recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(("count", "seed"), ROUNDS)
+def test_configurations_at_random(
+    small: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], count: int, seed: int
 ) -> None:
-    """Plan with a mutated configuration."""
     path = tmp_path / "d2.toml"
     tables = for_iterations(("densify", "prune", "depth_loss"), 100).to_toml().splitlines()
     whole = "\n".join(
@@ -88,7 +80,7 @@ def fuzz_configurations(
     )
     whole += "\n[plan]\ntemporal = true\n[priors]\ndepth_range = [1.0, 9.0]\n[priors.stereo]\nmin_angle = 1.0\n"
     whole += "[backbone]\nsh_degree = 1\n[d2]\nretire_after = 3\n"
-    words = ["plan", str(recording), "--train-cameras", "cam00,cam01", "--config", str(path)]
+    words = ["plan", str(small), "--train-cameras", "cam00,cam01", "--config", str(path)]
     path.write_text(whole)
     assert main(words) == 0, capsys.readouterr().err
     with bounded_memory():
@@ -98,8 +90,6 @@ def fuzz_configurations(
             expect_an_answer(words, capsys, f"configuration {seed} {number}")
 
 
-ROUNDS = [(FEW, 0), pytest.param(MANY, SEED, marks=pytest.mark.slow)]
-
 VARIABLES = ("D2_CACHE", "D2_CXXFLAGS", "CXX", "XDG_CACHE_HOME", "HOME", "TMPDIR", "COLUMNS", "TERM", "NO_COLOR")
 """What the commands read of the environment."""
 
@@ -107,10 +97,10 @@ VARIABLES = ("D2_CACHE", "D2_CXXFLAGS", "CXX", "XDG_CACHE_HOME", "HOME", "TMPDIR
 def every_flag() -> list[tuple[str, str]]:
     """Each command with each of its flags, those of tables and of both backbones included."""
     found: set[tuple[str, str]] = set()
-    for name, command in COMMANDS.items():
+    for name in COMMANDS:
         for more in ([], ["--backbone", "deform"], ["--calibration", "x"]):
             words = ["training", *more] if name == "bench" else more
-            form = command.form(f"d2 {name}") if isinstance(command, ModuleCommand) else _module(command).form(words)
+            form = form_of(name, words)
             names = [s.name for s in form.settings if not s.positional]
             names += [f"{section.name}.{s.name}" for section in form.sections(words).values() for s in section.settings]
             found |= {(name, flag_of(one)) for one in names if one != "output"}  # what can be written is written
@@ -124,7 +114,7 @@ def odd_word(rng: random.Random) -> str:
     return rng.choice((*map(str, ODD_VALUES), *ODD_TEXTS, *numbers, *places)).replace("\0", "")
 
 
-def fuzz_flags(count: int, seed: int, recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def fuzz_flags(count: int, seed: int, small: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Every flag of every command with odd values; no output can be written, and nothing is there to be shown."""
     flags = every_flag()
     (tmp_path / "file").write_text("in the way of every output")
@@ -136,7 +126,7 @@ def fuzz_flags(count: int, seed: int, recording: Path, tmp_path: Path, capsys: p
             rng = random.Random(f"flags {seed} {number}")
             name, flag = rng.choice(flags)
             first = {"demo": [], "bench": ["training", "nowhere@a+b"], "view": ["nowhere"]}
-            words = [name, *first.get(name, [str(recording)])]
+            words = [name, *first.get(name, [str(small)])]
             words += ["--train-cameras", "cam00,cam01"] if name in ("train", "plan", "priors", "ablate") else []
             words += [] if name in ("plan", "eval", "view", "compare", "doctor") else ["--output", "file/out"]
             words += ["--backbone", "deform"] if "hexplane" in flag else []
@@ -155,7 +145,7 @@ def installed_once(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(("count", "seed"), ROUNDS)
 def test_odd_flags_and_command_lines_at_random(
     fuzz: Callable[..., None],
-    recording: Path,
+    small: Path,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
@@ -163,24 +153,17 @@ def test_odd_flags_and_command_lines_at_random(
     seed: int,
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    fuzz(count, seed, recording, tmp_path, capsys)
+    fuzz(count, seed, small, tmp_path, capsys)
 
 
 @pytest.mark.parametrize(("count", "seed"), ROUNDS)
 def test_the_environment_at_random(
-    recording: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, count: int, seed: int
+    small: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, count: int, seed: int
 ) -> None:
     for number in range(count // 4):
         rng = random.Random(f"environment {seed} {number}")
         with monkeypatch.context() as changed:
             for variable in rng.sample(VARIABLES, 2):
                 changed.setenv(variable, odd_word(rng).encode("utf-8", "replace").decode())
-            words = rng.choice((["doctor"], ["--help"], ["plan", str(recording), "--train-cameras", "cam00,cam01"]))
+            words = rng.choice((["doctor"], ["--help"], ["plan", str(small), "--train-cameras", "cam00,cam01"]))
             expect_an_answer(words, capsys, f"environment {seed} {number}")
-
-
-@pytest.mark.parametrize(("count", "seed"), ROUNDS)
-def test_configurations_at_random(
-    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], count: int, seed: int
-) -> None:
-    fuzz_configurations(count, seed, recording, tmp_path, capsys)

@@ -53,14 +53,6 @@ def trainer_of(run: Run) -> object:
     return run._trainer(NO_POINTS)
 
 
-@pytest.mark.parametrize("hooks", [(), ("prior", "depth_loss")], ids=["bare", "with D2"])
-def test_there_is_one_with_and_without_d2_so_that_runs_compare(
-    scene: Path, tmp_path: Path, hooks: tuple[str, ...]
-) -> None:
-    run = run_of(scene, tmp_path / "run", store(tmp_path / "priors"), hooks=hooks)
-    assert trainer_of(run).model.background is not None
-
-
 def test_it_begins_with_the_colours_of_the_images(scene: Path, tmp_path: Path) -> None:
     run = run_of(scene, tmp_path / "run", None, hooks=())
     model, recording = trainer_of(run).model, run.scene.recording

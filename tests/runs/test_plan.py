@@ -11,6 +11,7 @@ import pytest
 from prior_cases import showing
 
 from d2_plugin.errors import D2Error
+from d2_plugin.priors.geometry import viewing_rays
 from d2_plugin.priors.settings import PriorSettings, StereoSettings
 from d2_plugin.priors.stereo import matched_depth
 from d2_plugin.protocol import Label
@@ -184,14 +185,12 @@ def test_a_colmap_model_brings_the_points_that_tell_the_depths(moving, tmp_path:
     undeclared = {name: replace(c, near_far=None) for name, c in moving.cameras.items()}
     still = replace(select_frames(moving, [0]), cameras=undeclared)
     depth, first = still.depth("train0", 0), still.cameras["train0"]
-    rows, columns = (values.ravel()[::37] for values in np.mgrid[:54, :96])
-    rays = np.stack([columns + 0.5, rows + 0.5, np.ones(rows.size)], -1) @ np.linalg.inv(first.K).T
-    points = (rays * depth[rows, columns, None] - first.T_camera_world[:3, 3]) @ first.T_camera_world[:3, :3]
+    in_camera = (viewing_rays(first, np.float64) * depth[..., None]).reshape(-1, 3)[::37]
+    points = (in_camera - first.T_camera_world[:3, 3]) @ first.T_camera_world[:3, :3]
     cloud = PointCloud(points, np.full(points.shape, 0.5))
     model = open_recording(export_recording(still, "colmap", tmp_path / "model", cloud=cloud))
-    names = PAIR
-    assert "depths unknown" not in plan_scene(model, names, None).as_dict()["stereo"]["reason"]
-    assert "depths unknown" in plan_scene(still, names, None).as_dict()["stereo"]["reason"]
+    assert "depths unknown" not in plan_scene(model, PAIR, None).as_dict()["stereo"]["reason"]
+    assert "depths unknown" in plan_scene(still, PAIR, None).as_dict()["stereo"]["reason"]
 
 
 def with_sensor(recording: Recording, folder: Path, *cameras: str) -> Recording:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
+from d2_plugin.priors.geometry import projected, viewing_rays
 from d2_plugin.recordings.synthetic.room import synthetic_recording
-from d2_plugin.runs.start import TimedPoints, TrainingFrames, initial_points, make_view, scene_extent
+from d2_plugin.runs.start import TimedPoints, TrainingFrames, initial_points, scene_extent
 
 CAMERAS = ("train0", "train1")
 
@@ -20,9 +23,8 @@ def recording():
 def surface_points(recording, count: int) -> np.ndarray:
     """Points on the surfaces that train0 sees."""
     depth, camera = recording.depth("train0", 0), recording.cameras["train0"]
-    rows, columns = np.unravel_index(np.linspace(0, depth.size - 1, count).astype(int), depth.shape)
-    pixels = np.stack([columns + 0.5, rows + 0.5, np.ones(count)], -1)
-    in_camera = pixels @ np.linalg.inv(camera.K).T * depth[rows, columns, None]
+    in_camera = (viewing_rays(camera, np.float64) * depth[..., None]).reshape(-1, 3)
+    in_camera = in_camera[np.linspace(0, depth.size - 1, count).astype(int)]
     return (in_camera - camera.T_camera_world[:3, 3]) @ camera.T_camera_world[:3, :3]
 
 
@@ -49,8 +51,6 @@ def test_extent_comes_from_points_where_there_are_enough(recording) -> None:
 
 
 def test_extent_falls_back_to_declared_bounds_and_then_to_the_rig(recording) -> None:
-    from dataclasses import replace
-
     nothing = np.zeros((0, 3))
     declared = scene_extent(recording, CAMERAS, nothing)
     near = min(recording.cameras[name].near_far[0] for name in CAMERAS)
@@ -74,11 +74,9 @@ def test_too_few_points_are_filled_up_inside_the_views(recording) -> None:
     assert (start.colors <= 1).all()
     assert (start.times <= 0.2).all()
     for name, rows in (("train0", slice(50, 225)), ("train1", slice(225, 400))):
-        view = make_view(recording, name, 0)
-        camera = positions[rows] @ view.T_camera_world[:3, :3].T + view.T_camera_world[:3, 3]
-        image = camera @ view.K.T
-        assert ((camera[:, 2] > 0.99 * extent.near) & (camera[:, 2] < 1.01 * extent.far)).all()
-        assert ((image[:, 0] / image[:, 2] > -0.01) & (image[:, 0] / image[:, 2] < 96.01)).all()
+        _, depths, inside = projected(recording.cameras[name], start.positions[rows])
+        assert inside.all()
+        assert ((depths > 0.99 * extent.near) & (depths < 1.01 * extent.far)).all()
 
 
 def test_what_one_camera_alone_sees_begins_at_the_depth_of_what_stands_around_it(recording) -> None:
@@ -89,40 +87,15 @@ def test_what_one_camera_alone_sees_begins_at_the_depth_of_what_stands_around_it
         sparse = TimedPoints(points[:known], np.full((known, 3), 0.5), np.zeros(known))
         return initial_points(recording, cameras, sparse, extent, minimum=known + 400).positions[known:]
 
-    def seen(name: str, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        camera = recording.cameras[name]
-        local = positions @ camera.T_camera_world[:3, :3].T + camera.T_camera_world[:3, 3]
-        pixels = (local @ camera.K.T)[:, :2] / local[:, 2:]
-        inside = (local[:, 2] > 0) & (pixels > 0).all(-1) & (pixels < [camera.width, camera.height]).all(-1)
-        return pixels, local[:, 2], inside
-
     drawn, placed = begin(50), begin(300)  # the former are too few to say anything
     for own, other, rows in (("train0", "train1", slice(0, 200)), ("train1", "train0", slice(200, 400))):
-        before, after = seen(own, drawn[rows]), seen(own, placed[rows])
-        alone = ~seen(other, drawn[rows])[2]
+        before, after = (projected(recording.cameras[own], some[rows]) for some in (drawn, placed))
+        alone = ~projected(recording.cameras[other], drawn[rows])[2]
         assert alone.any()
         assert not alone.all()
         np.testing.assert_allclose(after[0], before[0], atol=1e-9)  # on the ray of its pixel as before
         np.testing.assert_array_equal(placed[rows][~alone], drawn[rows][~alone])
-        _, depths, inside = seen(own, points)
+        _, depths, inside = projected(recording.cameras[own], points)
         apart = np.abs(after[1][alone][:, None] / depths[inside][None] - 1)
         np.testing.assert_allclose(apart.min(1), 0, atol=1e-12)
     np.testing.assert_array_equal(begin(50, CAMERAS[:1]), begin(300, CAMERAS[:1]))  # one camera: no second opinion
-
-
-def test_the_same_seed_gives_the_same_start(recording) -> None:
-    sparse = TimedPoints(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
-    extent = scene_extent(recording, CAMERAS, sparse.positions)
-    first, second, third = (initial_points(recording, CAMERAS, sparse, extent, seed, 100) for seed in (4, 4, 5))
-    for one, same, other in zip(first.tensors(), second.tensors(), third.tensors(), strict=True):
-        assert torch.equal(one, same)
-        assert not torch.equal(one, other)
-
-
-def test_points_come_back_from_their_file(recording, tmp_path) -> None:
-    points = TimedPoints(surface_points(recording, 20), np.full((20, 3), 0.25), np.linspace(0, 0.2, 20))
-    points.save(tmp_path / "points.npz")
-    again = TimedPoints.load(tmp_path / "points.npz")
-    for name in ("positions", "colors", "times"):
-        np.testing.assert_array_equal(getattr(again, name), getattr(points, name))
-    assert [path.name for path in tmp_path.iterdir()] == ["points.npz"]

@@ -27,7 +27,7 @@ from d2_plugin.runs.start import TimedPoints
 from d2_plugin.store.store import PriorStore
 
 NETWORK = "mobile_pydnet.onnx"
-TRAINED, WIDTH, HEIGHT = ("train0", "train1", "train2"), 160, 90
+TRAINED, WIDTH, HEIGHT = ("train0", "train1", "train2"), 128, 72
 NO_POINTS = TimedPoints(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
 GOOD, BAD = Score(0.8, 24.0), Score(0.7, 25.0)
 
@@ -87,7 +87,7 @@ def test_however_many_cameras_there_are_two_are_left_out_so_that_trials_cost_the
 
 @pytest.fixture(scope="module")
 def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    recording = synthetic_recording(cameras=3, held_out=0, frames=3, width=WIDTH, height=HEIGHT)
+    recording = synthetic_recording(cameras=3, held_out=0, frames=2, width=WIDTH, height=HEIGHT)
     return save_recording(recording, tmp_path_factory.mktemp("scene") / "room")
 
 
