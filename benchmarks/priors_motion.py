@@ -12,9 +12,9 @@ import numpy as np
 
 from d2_plugin.priors.between import CameraMotion, build_between
 from d2_plugin.priors.build import build_priors
+from d2_plugin.priors.geometry import viewing_rays
 from d2_plugin.priors.settings import PriorSettings
 from d2_plugin.protocol import Label
-from d2_plugin.recordings.recording import Camera
 from d2_plugin.recordings.synthetic.raycast import directions_of, first_hits
 from d2_plugin.recordings.synthetic.room import SyntheticSource, synthetic_recording
 from d2_plugin.runs.start import triangulated_points
@@ -143,16 +143,9 @@ def scene_flow(source: SyntheticSource, name: str, frame: int, later: int) -> np
 
 def _true_flow(source: SyntheticSource, name: str, frame: int, later: int) -> np.ndarray:
     """How far each pixel [H, W, 2] goes in the image from a frame to another."""
-    camera, depth = source.cameras[name], source.depth(name, frame)
-    rows, columns = np.mgrid[: camera.height, : camera.width] + 0.5
-    rays = np.stack([columns, rows, np.ones_like(rows)], -1) @ np.linalg.inv(camera.K).T
-    return _seen(camera, rays * depth[..., None], scene_flow(source, name, frame, later)) - np.stack(
-        [columns, rows], -1
-    )
-
-
-def _seen(camera: Camera, points: np.ndarray, moved: np.ndarray) -> np.ndarray:
-    """Where camera points [H, W, 3] are seen when they have moved in the world, [H, W, 2]."""
-    there = (points + moved @ camera.T_camera_world[:3, :3].T) @ camera.K.T
-    seen: np.ndarray = there[..., :2] / there[..., 2:]
-    return seen
+    camera = source.cameras[name]
+    points = viewing_rays(camera, np.float64) * source.depth(name, frame)[..., None]
+    moved = points + scene_flow(source, name, frame, later) @ camera.T_camera_world[:3, :3].T
+    begun, ended = (part @ camera.K.T for part in (points, moved))
+    flow: np.ndarray = ended[..., :2] / ended[..., 2:] - begun[..., :2] / begun[..., 2:]
+    return flow

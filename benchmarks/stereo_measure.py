@@ -24,7 +24,6 @@ class Run(NamedTuple):
     depths: list[GeometricDepth]
     cpu: float  # seconds per view, matching alone, over all threads
     wall: float  # seconds per view, matching alone
-    filter_cpu: float  # seconds per view
 
 
 def run(settings: StereoSettings, rig: Rig, depth_range: tuple[float, float], repeats: int) -> Run:
@@ -40,11 +39,10 @@ def run(settings: StereoSettings, rig: Rig, depth_range: tuple[float, float], re
         raw = patchmatch(grays, rig.cameras, depth_range, settings)
         cpu.append(time.process_time() - start[0])
         wall.append(time.perf_counter() - start[1])
-    start_filter = time.process_time()
     depths, costs = zip(*raw, strict=True)
     filtered = filter_depths(grays, rig.cameras, depths, costs, settings)
     views = len(rig.cameras)
-    return Run(filtered, median(cpu) / views, median(wall) / views, (time.process_time() - start_filter) / views)
+    return Run(filtered, median(cpu) / views, median(wall) / views)
 
 
 class Score(NamedTuple):
@@ -101,7 +99,7 @@ def measure(
         [truth for rig in rigs for truth in rig.truths],
         [seen for rig in rigs for seen in rig.covisible],
     )
-    times = {name: float(np.mean([getattr(each, name) for each in runs])) for name in ("cpu", "wall", "filter_cpu")}
+    times = {name: float(np.mean([getattr(each, name) for each in runs])) for name in ("cpu", "wall")}
     pixels = rigs[0].cameras[0].width * rigs[0].cameras[0].height
     numbers = {name: None if value != value else value for name, value in found._asdict().items()}
     return {**row, **numbers, **times, "microseconds_per_pixel": times["cpu"] / pixels * 1e6}

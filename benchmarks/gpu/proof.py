@@ -127,10 +127,6 @@ STEPS = {
         f"{PROFILE} {RASTER}profiled.jsonl --scenes synth:200000 --sizes 1920x1080 --seconds 0.1 --no-memory "
         "--error-limit 1",
     ),
-    "shim": Step(
-        *(140, (_tests,)),
-        "{pytest} -k shim tests/rasterizer/test_rasterizer_kernels.py tests/priors/test_patchmatch_gpu.py",
-    ),
 }
 """In the order in which they are worth the time."""
 

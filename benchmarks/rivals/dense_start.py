@@ -19,6 +19,7 @@ import numpy as np
 from benchmarks.emulated_multiview import emulated_multiview
 from benchmarks.rivals.inputs import Inputs
 from d2_plugin.errors import D2Error
+from d2_plugin.priors.geometry import viewing_rays
 from d2_plugin.recordings import Recording
 from d2_plugin.runs.start import TimedPoints
 from d2_plugin.settings import AtLeastOne, Positive, Seed, Settings
@@ -94,8 +95,7 @@ def back_projected(
     chosen = rng.choice(len(rows), min(count, len(rows)), replace=False)
     rows, columns = rows[chosen], columns[chosen]
     calibration = recording.cameras[camera]
-    pixels = np.stack([columns + 0.5, rows + 0.5, np.ones(len(rows))], 1)
-    in_camera = pixels @ np.linalg.inv(calibration.K).T * depth[rows, columns, None].astype(float)
+    in_camera = (viewing_rays(calibration, np.float64) * depth[..., None])[rows, columns]
     rotation, translation = calibration.T_camera_world[:3, :3], calibration.T_camera_world[:3, 3]
     colors = recording.image(camera, frame)[rows, columns] / 255
     return TimedPoints((in_camera - translation) @ rotation, colors, np.full(len(rows), recording.seconds(frame)))

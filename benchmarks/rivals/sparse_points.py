@@ -22,6 +22,7 @@ from torch import Tensor
 from benchmarks.rivals.inputs import Inputs, RivalLoss, expected_depth
 from d2_plugin.hooks import Context, HookConfig
 from d2_plugin.hooks.depth_loss import depth_and_alpha
+from d2_plugin.priors.geometry import projected
 from d2_plugin.protocol import View
 from d2_plugin.runs.start import scene_extent
 from d2_plugin.settings import NotNegative, Share
@@ -92,14 +93,11 @@ class SparsePointDepth(RivalLoss):
         return self._seen[key]
 
     def _find(self, view: View) -> Seen:
-        points = torch.tensor(self._of_this_instant(view), dtype=torch.float32, device=view.K.device)
-        camera = points @ view.T_camera_world[:3, :3].T + view.T_camera_world[:3, 3]
-        camera = camera[camera[:, 2] > 0]
-        pixels = (camera / camera[:, 2:]) @ view.K.T
-        inside = ((pixels[:, :2] >= 0) & (pixels[:, :2] < pixels.new_tensor([view.width, view.height]))).all(1)
-        pixels, depths = pixels[inside, :2], camera[inside, 2]
-        open_to_view = ~self._hidden(view, pixels, depths)
-        return Seen(pixels[open_to_view], depths[open_to_view])
+        camera = self.inputs.scene.recording.cameras[view.camera]
+        pixels, depths, inside = projected(camera, self._of_this_instant(view))
+        pixels, depths = pixels[inside], depths[inside]
+        shown = ~self._hidden(view, pixels, depths)
+        return Seen(*(torch.from_numpy(part[shown]).to(view.K) for part in (pixels, depths)))
 
     def _of_this_instant(self, view: View) -> np.ndarray:
         """Positions [M, 3] of the instant nearest in time."""
@@ -109,11 +107,11 @@ class SparsePointDepth(RivalLoss):
         away = np.abs(times - view.time)
         return positions[away <= away.min() + 1e-9]
 
-    def _hidden(self, view: View, pixels: Tensor, depths: Tensor) -> Tensor:
+    def _hidden(self, view: View, pixels: np.ndarray, depths: np.ndarray) -> np.ndarray:
         """Whether stereo sees a surface in front, bool [M]; no where there is no stereo."""
         stereo = self.inputs.stereo_depth(view.camera, view.frame)
         if stereo is None:
-            return torch.zeros_like(depths, dtype=torch.bool)
-        columns, rows = pixels.long().unbind(1)
-        surface = torch.from_numpy(stereo).to(depths)[rows, columns]
+            return np.zeros(len(depths), bool)
+        columns, rows = pixels.astype(int).T
+        surface = stereo[rows, columns]
         return (surface > 0) & (depths > surface * (1 + self.config.hidden))
