@@ -84,7 +84,7 @@ class Commands:
         before = {name: os.environ.get(name) for name in changed}
         os.environ.update(changed)
         try:
-            first = self._context.Process(target=_nothing)  # starts the process that the others are forked from
+            first = self._context.Process(target=os.getpid)  # starts the process that the others are forked from
             first.start()
             first.join()
         finally:
@@ -100,13 +100,9 @@ class Commands:
         process.start()
         return Started(process, log)
 
-    def run(self, words: list[str], fault: Fault | None = None, limit: float = 300) -> Ended:
+    def run(self, words: list[str], fault: Fault | None = None, kill_after: float | None = None) -> Ended:
         """A command, run to its end."""
-        return self.start(words, fault).end(limit)
-
-    def kill_after(self, words: list[str], seconds: float) -> Ended:
-        """A command that is killed (SIGKILL) after so many CPU seconds, unless it ended before."""
-        return self.start(words, kill_after=seconds).end()
+        return self.start(words, fault, kill_after).end()
 
 
 @dataclass(frozen=True)
@@ -116,12 +112,12 @@ class Started:
     process: BaseProcess
     log: Path
 
-    def end(self, limit: float = 300) -> Ended:
-        """Wait for it; one that takes longer is killed and reported."""
-        self.process.join(limit)
+    def end(self) -> Ended:
+        """Wait for it; one that takes more than five minutes is killed and reported."""
+        self.process.join(300)
         if self.process.is_alive():
             self.process.kill()
-            raise AssertionError(f"did not end within {limit} s: {self.log.read_text()[-2000:]}")
+            raise AssertionError(f"did not end within 300 s: {self.log.read_text()[-2000:]}")
         said = self.log.read_text(errors="replace") if self.log.exists() else ""
         counted = re.search(r"^counted (\d+) (\d+) (\S+)$", said, re.MULTILINE)
         operations, renames, cpu = counted.groups() if counted else (0, 0, 0)
@@ -131,10 +127,6 @@ class Started:
 def killed(ended: Ended) -> bool:
     """Whether it ended by SIGKILL."""
     return ended.code == -signal.SIGKILL
-
-
-def _nothing() -> None:
-    return
 
 
 def _command(words: list[str], log: str, fault: tuple[str, int, int, int] | None, kill_after: float | None) -> None:
@@ -166,17 +158,12 @@ def _command(words: list[str], log: str, fault: tuple[str, int, int, int] | None
 def contents(folder: Path) -> dict[str, Any]:
     """Everything below a folder by relative name, without what tells the time: hashes of files, and tables and
     checkpoints without seconds and circumstances."""
-    found: dict[str, Any] = {}
-    for path in sorted(folder.rglob("*")):
-        name = str(path.relative_to(folder))
-        if path.is_symlink():
-            found[name] = f"link to {os.readlink(path)}"
-        elif path.is_file():
-            found[name] = _content(path)
-    return found
+    return {str(path.relative_to(folder)): _content(path) for path in folder.rglob("*") if not path.is_dir()}
 
 
 def _content(path: Path) -> Any:
+    if path.is_symlink():
+        return f"link to {os.readlink(path)}"
     if path.name == "metrics.json":
         table = json.loads(path.read_text())
         return {name: value for name, value in table.items() if name not in ("seconds", "cpu_seconds", "made", "seal")}

@@ -30,51 +30,31 @@ class Hunk(NamedTuple):
     lines: list[str]
 
     @property
-    def context(self) -> dict[int, str]:
-        """Lines that must stand in the file, by their number in it."""
-        kept = [line[1:] for line in self.lines if not line.startswith("+")]
-        return {self.old + i: line for i, line in enumerate(kept)}
-
-    @property
     def added(self) -> list[str]:
-        return [line[1:] for line in self.lines if line.startswith("+")]
+        return [line[1:].strip() for line in self.lines if line.startswith("+")]
 
 
 def pages() -> list[str]:
     """Those that print a diff of a named file."""
-    return sorted(page.stem for page in PAGES.glob("*.md") if re.search(r"```diff\n--- a/", page.read_text()))
+    return sorted(page.stem for page in PAGES.glob("*.md") if "```diff\n--- a/" in page.read_text())
 
 
-def printed(page: str) -> str:
-    """The first diff of a file on a page as a patch; an empty line of context may have lost its space."""
-    text = re.search(r"```diff\n(--- a/.*?)```", (PAGES / f"{page}.md").read_text(), re.DOTALL)
-    assert text, f"{page}.md prints no diff"
-    return "".join(f"{line or ' '}\n" for line in text[1].splitlines())
-
-
-def file_of(patch: str) -> str:
-    found = re.findall(r"^--- a/(.*)$", patch, re.MULTILINE)
-    assert len(found) == 1, f"one file for each page, got {found}"
-    return found[0]
-
-
-def hunks(patch: str) -> list[Hunk]:
+def printed(page: str) -> tuple[str, list[Hunk]]:
+    """The file that the first diff on a page is of, and its places."""
+    file, body = re.search(r"```diff\n--- a/(\S+)\n(.*?)```", (PAGES / f"{page}.md").read_text(), re.DOTALL).groups()
+    assert "--- a/" not in body, "one file for each page"
     found: list[Hunk] = []
-    for line in patch.splitlines():
+    for line in body.splitlines():
         if head := _HUNK.match(line):
             found.append(Hunk(*(int(number) for number in head.groups()), []))
         elif found:
-            found[-1].lines.append(line)
-    return found
+            found[-1].lines.append(line or " ")  # an empty line of context may have lost its space
+    return file, found
 
 
 def checksum(line: str) -> str:
     """Of a line's words: indentation and blanks at the end are left to `git apply --ignore-whitespace`."""
     return f"{zlib.crc32(' '.join(line.split()).encode()):08x}"
-
-
-def checksums(page: str, file: str) -> list[str]:
-    return COMMITS[page]["files"][file].split()
 
 
 IMPORT = "from d2_plugin import D2Hooks"
@@ -91,18 +71,19 @@ class TestEveryPage:
         assert COMMITS[page]["commit"] in (PAGES / f"{page}.md").read_text()
 
     def test_its_context_stands_in_that_file_at_the_printed_lines(self, page: str) -> None:
-        patch = printed(page)
-        lines = checksums(page, file_of(patch))
+        file, hunks = printed(page)
+        checksums = COMMITS[page]["files"][file].split()
         moved = 0
-        for hunk in hunks(patch):
-            for number, line in hunk.context.items():
-                assert lines[number - 1] == checksum(line), f"line {number} of {file_of(patch)} is not '{line.strip()}'"
+        for hunk in hunks:
+            context = [line[1:] for line in hunk.lines if not line.startswith("+")]
+            for number, line in enumerate(context, hunk.old):
+                assert checksums[number - 1] == checksum(line), f"line {number} of {file} is not '{line.strip()}'"
             after = [line for line in hunk.lines if not line.startswith("-")]
-            assert (hunk.olds, hunk.new, hunk.news) == (len(hunk.context), hunk.old + moved, len(after)), "for git"
+            assert (hunk.olds, hunk.new, hunk.news) == (len(context), hunk.old + moved, len(after)), "for git"
             moved += hunk.news - hunk.olds
 
     def test_it_adds_an_import_and_three_lines(self, page: str) -> None:
-        added = [line.strip() for hunk in hunks(printed(page)) for line in hunk.added]
+        added = [line for hunk in printed(page)[1] for line in hunk.added]
         assert added.count(IMPORT) == 1
         lines = [line for line in added if line != IMPORT]
         assert len(lines) == 3

@@ -69,13 +69,17 @@ class Case(NamedTuple):
     """By the plugin itself: what is read is what was written."""
 
 
+def depth_folder(path: Path) -> Path:
+    return path.parent if path.name == "depth.json" else path.parent.parent
+
+
 def sensor(path: Path) -> np.ndarray | None:
     camera = Camera("cam00", 48, 32, np.diag([40.0, 40, 1]), np.eye(4))
-    return SensorDepth(path.parent if path.name == "depth.json" else path.parent.parent, ["cam00"]).depth(camera, 0)
+    return SensorDepth(depth_folder(path), ["cam00"]).depth(camera, 0)
 
 
 def write_sensor(path: Path) -> None:
-    folder = path.parent if path.name == "depth.json" else path.parent.parent
+    folder = depth_folder(path)
     (folder / "cam00").mkdir(parents=True, exist_ok=True)
     (folder / "depth.json").write_text('{"unit": "mm"}')
     if path.suffix == ".npy":
@@ -95,14 +99,6 @@ def some_rows() -> list[str]:
     for line in (Path(__file__).parents[1] / "data" / "runs.jsonl").read_text().splitlines(keepends=True):
         found.setdefault(json.loads(line)["kind"], []).append(line)
     return [line for lines in found.values() for line in lines[:2]]
-
-
-def network(path: Path) -> np.ndarray:
-    return MonocularModel(path, "relative")(IMAGE)
-
-
-def video(path: Path) -> np.ndarray:
-    return VideoFrames({"a": read_video(path)}).image("a", 1)
 
 
 def write_video(path: Path) -> None:
@@ -164,7 +160,7 @@ CASES = {
     "npz": Case("a.npz", lambda p: np.savez_compressed(p, depth=MAP), lambda p: read_array(p, key="depth")),
     "png": Case("a.png", lambda p: write_png(p, IMAGE), lambda p: (image_size(p), read_image(p))),
     "jpeg": Case("a.jpg", lambda p: cv2.imwrite(str(p), IMAGE), lambda p: (image_size(p), read_image(p))),
-    "video": Case("a.mp4", write_video, video),
+    "video": Case("a.mp4", write_video, lambda p: VideoFrames({"a": read_video(p)}).image("a", 1)),
     "dense": Case("a.bin", lambda p: write_dense_array(p, MAP), read_dense_array),
     "sensor json": Case("depth.json", write_sensor, sensor),
     "sensor npy": Case("depth/cam00/0.npy", write_sensor, sensor),
@@ -175,7 +171,7 @@ CASES = {
         lambda p: export_recording(small_recording(), "transforms", p.parent),
         lambda p: RenamedStore.of_export(None, p.parent),
     ),
-    "onnx": Case("net.onnx", lambda p: mean_network(p, 32, 48), network),
+    "onnx": Case("net.onnx", lambda p: mean_network(p, 32, 48), lambda p: MonocularModel(p, "relative")(IMAGE)),
     "store": Case("store/store.json", write_store, read_store, kept=True),
     "record": Case("store/priors/a/00000.json", write_store, read_store, kept=True),
     "prior": Case("store/priors/b/00000.npy", write_store, read_store, kept=True),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 from collections.abc import Callable
@@ -11,8 +10,6 @@ from pathlib import Path
 import pytest
 
 from d2_plugin.commands.cli import main
-from d2_plugin.recordings.export.folder import described
-from d2_plugin.recordings.synthetic.room import synthetic_recording
 
 pytest.importorskip("av")
 pytest.importorskip("cv2")
@@ -65,50 +62,38 @@ def lines(text: str) -> list[Words]:
     return [case.split() for line in text.strip().splitlines() for case in line.split(" | ")]
 
 
-def train(recording: Path, output: Path, *more: str) -> Words:
-    words = ["train", str(recording), "--train-cameras", "train0,train1", "--iterations", "3"]
-    return [*words, "--output", str(output), *more]
-
-
-def imported(place: Path, videos: Path, output: Path) -> Words:
-    words = ["import", str(videos), "--calibration", str(place / "cameras.json"), "--output", str(output)]
-    return [*words, "--offsets", "none"]
-
-
 @pytest.fixture(scope="module")
-def place(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """videos/ with a video of each camera and cameras.json, a filmed `room` and a trained `run`."""
-    from recorded import write_video
-
-    folder = tmp_path_factory.mktemp("newer")
-    filmed = synthetic_recording(cameras=2, held_out=0, frames=12, width=96, height=54, arc_degrees=15)
-    (folder / "videos").mkdir()
-    for name in filmed.cameras:
-        images = [filmed.image(name, frame) for frame in filmed.frames]
-        write_video(folder / "videos" / f"{name}.mp4", images, [frame / filmed.fps for frame in filmed.frames])
-    (folder / "cameras.json").write_text(json.dumps(described(filmed)))
+def place(recording: Path, videos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder `videos`, a filmed `room` and a trained `run`."""
+    folder = tmp_path_factory.mktemp("hostile")
+    shutil.copytree(videos, folder / "videos")
     shutil.copytree(recording, folder / "room")
-    words = ["train", str(folder / "room"), "--train-cameras", "train0,train1", "--iterations", "3", "--hooks", "none"]
-    assert main([*words, "--output", str(folder / "run")]) == 0
+    assert main([*train(folder / "room"), "--hooks", "none", "--output", str(folder / "run")]) == 0
     return folder
 
 
+def train(recording: Path) -> Words:
+    return ["train", str(recording), "--train-cameras", "train0,train1", "--iterations", "3"]
+
+
+def imported(place: Path, videos: Path, output: Path) -> Words:
+    calibration = ["--calibration", str(place / "room" / "cameras.json"), "--offsets", "none"]
+    return ["import", str(videos), *calibration, "--output", str(output)]
+
+
 def test_flags(recording: Path, tmp_path: Path, refused: Refused) -> None:
-    begin = train(recording, tmp_path / "run")
     for words in lines(FLAGS):
-        refused(*begin, *words)
+        refused(*train(recording), "--output", tmp_path / "run", *words)
 
 
 def test_imports(place: Path, tmp_path: Path, refused: Refused) -> None:
-    begin = imported(place, place / "videos", tmp_path / "out")
     for words in lines(IMPORTS):
-        refused(*begin, *words)
+        refused(*imported(place, place / "videos", tmp_path / "out"), *words)
 
 
 def test_videos(place: Path, tmp_path: Path, refused: Refused) -> None:
-    begin = ["render", str(place / "run"), "--output", str(tmp_path / "a.mp4")]
     for words in lines(VIDEOS):
-        refused(*begin, *words)
+        refused("render", place / "run", "--output", tmp_path / "a.mp4", *words)
     assert not list(tmp_path.iterdir())
 
 

@@ -24,7 +24,7 @@ from d2_plugin.adapters.yang4d import Yang4DAdapter
 from d2_plugin.config import D2Config, DensifyConfig, DepthLossConfig, PruneConfig
 from d2_plugin.errors import D2Error
 from d2_plugin.plugin import D2Hooks
-from d2_plugin.protocol import DepthPrior, Points, Splats, View
+from d2_plugin.protocol import DepthPrior, Splats
 
 VIEWS = make_views()
 
@@ -54,24 +54,19 @@ def verified(prior: DepthPrior, depth: float) -> DepthPrior:
     ("change", "says"),
     [
         (lambda prior: "x", "is a str, expected d2_plugin.protocol.DepthPrior or None"),
-        (lambda prior: tuple(prior), "is a tuple, expected"),
-        (lambda prior: prior._replace(labels=prior.labels[1:]), "has maps of several sizes"),
         (lambda prior: prior._replace(sigma=prior.depth[1:]), "has maps of several sizes"),
         (lambda prior: prior._replace(sigma="x"), "give tensors"),
-        (lambda prior: prior._replace(depth=prior.depth.to("meta")), "give tensors"),
         (lambda prior: prior._replace(depth=prior.depth.to_sparse()), "give tensors"),
         (lambda prior: prior._replace(colors=torch.rand(24, 32, 3)), "give uint8"),
         (lambda prior: prior._replace(reliability=-prior.depth), "reliability outside of 0..1"),
         (lambda prior: prior._replace(depth=prior.depth.numpy()), "has no depth as a map"),
         (lambda prior: prior._replace(depth=prior.depth.long()), "not float32: give depth, sigma and reliability"),
-        (lambda prior: prior._replace(depth=prior.depth.bfloat16()), "not float32: give depth, sigma and reliability"),
         (lambda prior: prior._replace(sigma=prior.depth.half()), "not float32: give depth, sigma and reliability"),
         (lambda prior: prior._replace(labels=torch.full_like(prior.labels, 9)), "has 768 labels that are none"),
-        *((lambda prior, depth=depth: prior._replace(depth=torch.full_like(prior.depth, depth)), "of 744 pixels .* 744")
-          for depth in (float("nan"), float("inf"), -3.0, 0.0)),
+        (lambda prior: prior._replace(depth=torch.full_like(prior.depth, math.nan)), "of 744 pixels .* 744"),
         (lambda prior: prior._replace(sigma=-torch.ones_like(prior.depth)), "of 744 pixels .* 744"),
     ],
-)  # fmt: skip
+)
 def test_a_prior_that_cannot_be_is_refused(change: Callable[[DepthPrior], object], says: str) -> None:
     with pytest.raises(D2Error, match=f"the prior of camera cam0, frame 0 .*{says}"):
         hooks(ChangedStore(change)).loss(1, VIEWS[0])
@@ -85,7 +80,7 @@ def test_a_prior_in_float64_densifies() -> None:
     assert int((d2.inserted_at > 0).sum()) > 0
 
 
-@pytest.mark.parametrize("depth", [float("nan"), float("inf"), -3.0, 0.0])
+@pytest.mark.parametrize("depth", [math.nan, math.inf, -3.0, 0.0])
 def test_some_pixels_of_a_prior_that_cannot_be_are_counted_once_per_camera(
     depth: float, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -96,7 +91,6 @@ def test_some_pixels_of_a_prior_that_cannot_be_are_counted_once_per_camera(
 
 
 FIRST = VIEWS[0]
-ODD_TENSORS = (lambda m: m.to("meta"), lambda m: m.to_sparse(), lambda m: m + 0j)
 
 
 @pytest.mark.parametrize(
@@ -107,14 +101,14 @@ ODD_TENSORS = (lambda m: m.to("meta"), lambda m: m.to_sparse(), lambda m: m + 0j
             torch.diag(torch.tensor([1.0, 1, 1, 0])))),
         ({"K": FIRST.K * torch.tensor([[1.0, 1, 1], [1, 1, 1], [1, 1, 0]])}, "is no rotation and shift, or K has"),
         ({"K": FIRST.K + torch.tensor([[0.0, 0, 0], [5, 0, 0], [0, 0, 0]])}, "is no rotation and shift, or K has"),
-        *(({"K": change(FIRST.K)}, "K of the view .* expected a plain tensor") for change in ODD_TENSORS),
-        *(({"T_camera_world": change(torch.eye(4))}, "world of the view .* a plain tensor") for change in ODD_TENSORS),
+        ({"K": FIRST.K.to("meta")}, "K of the view .* expected a plain tensor"),
+        ({"K": FIRST.K + 0j}, "K of the view .* expected a plain tensor"),
+        ({"T_camera_world": torch.eye(4).to_sparse()}, "world of the view .* a plain tensor"),
         ({"K": torch.zeros(3, 3)}, "focal lengths 0 and 0, expected positive"),
         ({"K": torch.full((3, 3), torch.nan)}, "K of the view .* not finite"),
         ({"K": torch.eye(4)}, r"K of the view .* is torch.float32 \(4, 4\), expected a plain tensor \(3, 3\)"),
-        ({"T_camera_world": None}, r"T_camera_world .* is NoneType, expected a plain tensor \(4, 4\)"),
+        ({"T_camera_world": None}, "T_camera_world .* is NoneType, expected a plain tensor"),
         ({"width": 0}, "0x24 pixels, expected at least one"),
-        ({"time": "x"}, "the time of a view must be"),
         ({"time": math.nan}, "the time of a view must be"),
         ({"frame": 0.5}, "the frame of a view must be"),
         ({"camera": None}, "the camera of a view must be"),
@@ -167,31 +161,29 @@ def test_what_is_no_store_configuration_or_backbone_is_refused(given: dict[str, 
         hooks(**given)
 
 
-class Lazy(Yang4DAdapter):
-    """Inserts nothing, and says what it is told to."""
-
-    said: object = 0
-
-    def insert(self, points: Points) -> int:
-        return self.said  # type: ignore[return-value]
-
-
-@pytest.mark.parametrize("said", [0, 3, None, True])
-def test_an_insert_that_does_nothing_is_noticed(said: object, caplog: pytest.LogCaptureFixture) -> None:
-    adapter = Lazy(make_model())
-    adapter.said = said
+def inserting(said: object) -> D2Hooks:
+    """Hooks on a backbone that inserts nothing, and says this."""
+    adapter = make_adapter(make_model())
+    adapter.insert = lambda points: said
     d2 = hooks(config=D2Config(densify=DensifyConfig(start=1, every=1)), adapter=adapter)
     d2.loss(1, VIEWS[0])
-    if said == 0 and said is not True:
-        for step in (1, 2):
-            d2.step(step)
-        assert caplog.text.count("insert() of the backbone added none of") == 1
-    else:
-        with pytest.raises(D2Error, match=r"insert\(\) was given .* and returned .*return how many were added"):
-            d2.step(1)
+    return d2
 
 
-@pytest.mark.parametrize("name", ["gsplat", "fudan", "yang4d", "hust4d", "deformable3d", "spacetime", "ex4dgs"])
+def test_an_insert_that_adds_nothing_is_named_once(caplog: pytest.LogCaptureFixture) -> None:
+    d2 = inserting(0)
+    for step in (1, 2):
+        d2.step(step)
+    assert caplog.text.count("insert() of the backbone added none of") == 1
+
+
+@pytest.mark.parametrize("said", [3, None, True])
+def test_an_insert_that_says_another_number_is_refused(said: object) -> None:
+    with pytest.raises(D2Error, match=r"insert\(\) was given .* and returned .*return how many were added"):
+        inserting(said).step(1)
+
+
+@pytest.mark.parametrize("name", ["gsplat", "fudan", "yang4d", "ex4dgs"])
 @pytest.mark.parametrize("model", [(), (object(),), (None, None)], ids=["nothing", "object", "none"])
 def test_an_adapter_of_the_wrong_object_says_so(name: str, model: tuple) -> None:
     sentence = r"the adapter 'gsplat' cannot take object .*docstring of GsplatAdapter"
@@ -227,38 +219,37 @@ def test_what_is_no_step(step: Any) -> None:
             call()
 
 
-class InFloat64(Yang4DAdapter):
-    """Gaussians in float64."""
-
-    def slice_at(self, view: View) -> Splats:
-        return Splats(*(part.double() if part.is_floating_point() else part for part in super().slice_at(view)))
+def in_float64(splats: Splats) -> Splats:
+    return Splats(*(part.double() if part.is_floating_point() else part for part in splats))
 
 
-class Torn(Yang4DAdapter):
+def torn(splats: Splats) -> Splats:
     """Of one Gaussian it is not said which it is."""
-
-    def slice_at(self, view: View) -> Splats:
-        splats = super().slice_at(view)
-        return splats._replace(rows=splats.rows[:-1])
+    return splats._replace(rows=splats.rows[:-1])
 
 
 @pytest.mark.parametrize(
-    ("adapter", "config", "says"),
+    ("change", "config", "says"),
     [
-        (InFloat64, {"densify": DensifyConfig(start=0, every=1)}, "densify inserts float32 .* returned torch.float64"),
-        (Torn, {"prune": PruneConfig(start=0, every=1)}, "returned means .*, rows .*, expected M rows each"),
+        (in_float64, {"densify": DensifyConfig(start=0, every=1)}, "densify inserts float32 .* returned torch.float64"),
+        (torn, {"prune": PruneConfig(start=0, every=1)}, "returned means .*, rows .*, expected M rows each"),
     ],
 )
-def test_a_slice_that_cannot_be_is_refused(adapter: type[Yang4DAdapter], config: dict[str, Any], says: str) -> None:
-    d2 = hooks(config=D2Config(**config), adapter=adapter(make_model()))
+def test_a_slice_that_cannot_be_is_refused(
+    change: Callable[[Splats], Splats], config: dict[str, Any], says: str
+) -> None:
+    adapter = make_adapter(make_model())
+    whole = adapter.slice_at
+    adapter.slice_at = lambda view: change(whole(view))
+    d2 = hooks(config=D2Config(**config), adapter=adapter)
     d2.loss(1, VIEWS)
     with pytest.raises(D2Error, match=says):
         d2.step(1)
 
 
 @contextmanager
-def default(dtype: torch.dtype) -> Iterator[None]:
-    torch.set_default_dtype(dtype)
+def float64_by_default() -> Iterator[None]:
+    torch.set_default_dtype(torch.float64)
     try:
         yield
     finally:
@@ -267,13 +258,8 @@ def default(dtype: torch.dtype) -> Iterator[None]:
 
 @pytest.mark.parametrize(
     "around",
-    [
-        lambda: default(torch.float64),
-        lambda: default(torch.float16),
-        lambda: torch.device("meta"),
-        torch.inference_mode,
-    ],
-    ids=["float64", "float16", "meta", "inference"],
+    [float64_by_default, lambda: torch.device("meta"), torch.inference_mode],
+    ids=["float64", "meta", "inference"],
 )
 def test_what_torch_does_to_every_tensor_is_refused_where_d2_cannot_work_with_it(around: Callable) -> None:
     d2 = hooks()

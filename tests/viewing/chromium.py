@@ -82,8 +82,12 @@ def browser(width: int = 960, height: int = 600) -> Iterator[Any]:
             program.close()
 
 
-def image(address: str) -> np.ndarray:
-    """RGB uint8 [H, W, 3] of a PNG in a data: address, as canvas.toDataURL gives it."""
+def decoded(png: bytes) -> np.ndarray:
+    """RGB uint8 [H, W, 3] of a PNG."""
     cv2 = pytest.importorskip("cv2", reason="opencv is in the `image` extra")
-    data = np.frombuffer(base64.b64decode(address.partition(",")[2]), np.uint8)
-    return cv2.imdecode(data, cv2.IMREAD_COLOR)[..., ::-1]
+    return cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+
+
+def image(address: str) -> np.ndarray:
+    """The image of a data: address, as canvas.toDataURL gives it."""
+    return decoded(base64.b64decode(address.partition(",")[2]))

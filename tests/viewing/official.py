@@ -32,12 +32,10 @@ def filled(shapes: Shapes) -> dict[str, Tensor]:
 
 def _layers(names: Mapping[str, tuple[int, int]]) -> dict[str, tuple[int, ...]]:
     """Weight and bias of linear layers (out, in)."""
-    parts = [(name, size) for name, size in names.items()]
-    return {
-        f"{name}.{part}": (size if part == "weight" else size[:1])
-        for name, size in parts
-        for part in ("weight", "bias")
-    }
+    found: dict[str, tuple[int, ...]] = {}
+    for name, size in names.items():
+        found |= {f"{name}.weight": size, f"{name}.bias": size[:1]}
+    return found
 
 
 def motion_network(variant: str = "plain") -> dict[str, Tensor]:
@@ -106,19 +104,26 @@ def inria_columns(count: int, seed: int = 5) -> dict[str, Tensor]:
     }
 
 
+def columns_of(**values: Tensor) -> dict[str, Tensor]:
+    """The columns of a PLY by name: of several of one name each has its number behind it."""
+    found = {}
+    for name, value in values.items():
+        several = {f"{name}_{i}": value[:, i] for i in range(value.shape[1])}
+        found |= several if value.shape[1] > 1 else {name: value[:, 0]}
+    return found
+
+
+def places(positions: Tensor) -> dict[str, Tensor]:
+    return {axis: positions[:, i] for i, axis in enumerate("xyz")}
+
+
 def write_inria_ply(path: Path, model: Mapping[str, Tensor]) -> None:
     """As `save_ply` of Inria's heirs: normals of zero, harmonics with all of one channel together."""
-    flat = {
-        "f_dc": model["_features_dc"].transpose(1, 2).flatten(1),
-        "f_rest": model["_features_rest"].transpose(1, 2).flatten(1),
-        "scale": model["_scaling"],
-        "rot": model["_rotation"],
-    }
-    columns = {axis: model["_xyz"][:, i] for i, axis in enumerate("xyz")}
-    columns |= {f"n{axis}": torch.zeros(len(model["_xyz"])) for axis in "xyz"}
-    columns |= {f"{name}_{i}": values[:, i] for name, values in flat.items() for i in range(values.shape[1])}
-    columns["opacity"] = model["_opacity"][:, 0]
-    write_ply(path, columns)
+    normals = {f"n{axis}": torch.zeros(len(model["_xyz"])) for axis in "xyz"}
+    colors = {"f_dc": model["_features_dc"].transpose(1, 2).flatten(1)}
+    colors |= {"f_rest": model["_features_rest"].transpose(1, 2).flatten(1)}
+    shape = columns_of(scale=model["_scaling"], rot=model["_rotation"], opacity=model["_opacity"])
+    write_ply(path, places(model["_xyz"]) | normals | columns_of(**colors) | shape)
 
 
 def write_ply(path: Path, columns: Mapping[str, Tensor]) -> None:

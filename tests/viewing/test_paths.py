@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 
 from d2_plugin.errors import D2Error
 from d2_plugin.recordings import Camera
-from d2_plugin.recordings.cameras.camera import OPENGL_TO_OPENCV
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.viewing.camera_paths import (
     MARGIN,
@@ -115,13 +114,13 @@ SOMEWHERE = np.eye(4).flatten().tolist()
 
 
 class TestCameraPathFiles:
-    def write(self, folder: Path, camera: Camera, **more: object) -> Path:
-        opengl = np.linalg.inv(camera.T_camera_world) @ OPENGL_TO_OPENCV
-        fov = float(np.degrees(2 * np.arctan(camera.height / 2 / camera.K[1, 1])))
-        entry = {"camera_to_world": opengl.flatten().tolist(), "fov": fov, "aspect": 1.0}
-        table = {"render_width": 96, "render_height": 54, "fps": 24, "camera_path": [entry, entry]} | more
+    @staticmethod
+    def write(folder: Path, **more: object) -> Path:
         path = folder / "camera_path.json"
-        path.write_text(json.dumps(table))
+        table = json.loads(camera_path_text([ARC[0], ARC[0]], [0.0, 1.0], 24))
+        for entry in table["camera_path"]:
+            del entry["render_time"]
+        path.write_text(json.dumps({name: value for name, value in table.items() if name != "seconds"} | more))
         return path
 
     def test_a_path_that_is_written_is_read(self, tmp_path: Path) -> None:
@@ -134,8 +133,8 @@ class TestCameraPathFiles:
             assert np.isclose(camera.K[1, 1], true.K[1, 1])
 
     def test_it_lasts_as_long_as_it_says_and_times_count_only_where_all_have_one(self, tmp_path: Path) -> None:
-        assert read_camera_path(self.write(tmp_path, ARC[0], seconds=4.0)).fps == 0.5
-        path = self.write(tmp_path, ARC[0])
+        assert read_camera_path(self.write(tmp_path, seconds=4.0)).fps == 0.5
+        path = self.write(tmp_path)
         table = json.loads(path.read_text())
         table["camera_path"][0]["render_time"] = 0.25
         path.write_text(json.dumps(table))
@@ -162,4 +161,4 @@ class TestCameraPathFiles:
     )
     def test_another_file_is_refused_in_a_sentence(self, tmp_path: Path, change: dict, said: str) -> None:
         with pytest.raises(D2Error, match=said):
-            read_camera_path(self.write(tmp_path, ARC[0], **change))
+            read_camera_path(self.write(tmp_path, **change))

@@ -12,12 +12,14 @@ import numpy as np
 import pytest
 import torch
 from command_lines import refused
-from viewing.hostile import emptied, of_another_version, still_training
+from viewing.export.scenes import psnr
 
 from d2_plugin.commands.cli import main
+from d2_plugin.durable import write_table
 from d2_plugin.errors import D2Error, MissingExtra
 from d2_plugin.recordings.images import read_image
 from d2_plugin.runs.run import Run
+from d2_plugin.runs.saved import RUN, save_checkpoint
 from d2_plugin.runs.start import make_view
 from d2_plugin.viewing.panels import KINDS, Shot
 from d2_plugin.viewing.videos.plan import RenderSettings, plan_video
@@ -31,10 +33,6 @@ av = pytest.importorskip("av", reason="PyAV is in the `video` extra")
 def video_of(path: Path) -> list[np.ndarray]:
     with av.open(str(path)) as container:
         return [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
-
-
-def decibels(a: np.ndarray, b: np.ndarray) -> float:
-    return -10 * np.log10(np.mean((a.astype(float) / 255 - b) ** 2) + 1e-12)
 
 
 @pytest.fixture(scope="module")
@@ -58,9 +56,9 @@ def test_a_held_out_camera_plays_the_whole_recording_as_the_rasterizer_draws_it(
     found = video_of(tmp_path / "a.mp4")
     assert len(found) == 4
     assert found[0].shape == (54, 96, 3)
-    assert decibels(found[0], rendered("test0", 0)) >= 35
-    assert decibels(found[-1], rendered("test0", 3)) >= 35
-    assert decibels(found[0], rendered("train0", 0)) < 30, "another camera is another image"
+    assert psnr(found[0] / 255, rendered("test0", 0)) >= 35
+    assert psnr(found[-1] / 255, rendered("test0", 3)) >= 35
+    assert psnr(found[0] / 255, rendered("train0", 0)) < 30, "another camera is another image"
 
 
 def test_an_orbit_has_the_asked_length_rate_and_odd_size(trained: Path, tmp_path: Path) -> None:
@@ -83,8 +81,8 @@ def test_a_camera_path_of_nerfstudio_is_followed(
     path.write_text(json.dumps({"render_width": 96, "render_height": 54, "fps": 5, "camera_path": entries}))
     run(RenderSettings((trained,), output=tmp_path / "png", path=str(path), format="png"))
     found = [read_image(tmp_path / "png" / name) for name in ("00000.png", "00001.png")]
-    assert decibels(found[0], rendered("train1", 0)) > 45
-    assert decibels(found[1], rendered("train1", 3)) > 45
+    assert psnr(found[0] / 255, rendered("train1", 0)) > 45
+    assert psnr(found[1] / 255, rendered("train1", 3)) > 45
 
 
 def test_time_plays_bounces_slows_and_freezes(viewed: ViewedRun) -> None:
@@ -103,7 +101,7 @@ def test_time_plays_bounces_slows_and_freezes(viewed: ViewedRun) -> None:
         plan_video(viewed, RenderSettings((), at=3.0))
 
 
-@pytest.mark.parametrize("settings", [{"seconds": 1e6}, {"speed": 1e-6}, {"path": "orbit", "seconds": 1e6}])
+@pytest.mark.parametrize("settings", [{"seconds": 1e6}, {"speed": 1e-6}])
 def test_a_video_without_end_is_refused_before_it_is_laid_out(viewed: ViewedRun, settings: dict) -> None:
     with pytest.raises(D2Error, match="images, at most 1000000: choose fewer --seconds"):
         plan_video(viewed, RenderSettings((), **settings))
@@ -162,19 +160,29 @@ def test_what_cannot_be_shown_is_one_sentence(
 def test_a_run_of_which_nothing_is_left_or_known_is_one_sentence(
     trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str
 ) -> None:
-    assert "has no Gaussian left at step 40" in refused(capsys, command, emptied(trained, tmp_path / "empty"))
-    assert "version 99" in refused(capsys, command, of_another_version(trained, tmp_path / "later"))
-    (tmp_path / "empty" / "checkpoint.pt").unlink()
-    assert "holds no checkpoint yet" in refused(capsys, command, tmp_path / "empty")
+    folder = shutil.copytree(trained, tmp_path / "run")
+    state = torch.load(folder / "checkpoint.pt", weights_only=True)
+    parts = {name: {key: row[:0] for key, row in state["model"][name].items()} for name in ("parameters", "statistics")}
+    state["model"] = parts | {"optimizer": state["model"]["optimizer"] | {"state": {}}}
+    save_checkpoint(folder / "checkpoint.pt", state)
+    assert "has no Gaussian left at step 40" in refused(capsys, command, folder)
+    (folder / "checkpoint.pt").unlink()
+    assert "holds no checkpoint yet" in refused(capsys, command, folder)
+    table = json.loads((folder / "run.json").read_text())
+    plain = {name: value for name, value in table.items() if name not in ("format", "seal")}
+    write_table(folder / "run.json", plain | {"version": 99}, RUN)
+    assert "version 99" in refused(capsys, command, folder)
 
 
 @pytest.mark.parametrize("command", ["render", "export"])
 def test_a_run_that_still_trains_and_has_no_prior_is_shown_with_a_note(
     bare: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str
 ) -> None:
-    copy = still_training(bare, tmp_path / "<script>alert(1)<", 1)
-    assert main([command, str(copy), "--output", str(tmp_path / "out.mp4")]) == 0
-    assert f"{copy.name} still trains: this is step 1 of 2" in capsys.readouterr().out
+    folder = shutil.copytree(bare, tmp_path / "<script>alert(1)<")
+    state = torch.load(folder / "checkpoint.pt", weights_only=True)
+    save_checkpoint(folder / "checkpoint.pt", state | {"step": 1})
+    assert main([command, str(folder), "--output", str(tmp_path / "out.mp4")]) == 0
+    assert f"{folder.name} still trains: this is step 1 of 2" in capsys.readouterr().out
 
 
 def soft(count: int, width: int, height: int) -> list[np.ndarray]:
@@ -194,14 +202,7 @@ def write(path: Path, images: list[np.ndarray], fps: float = 30, form: str = "mp
             add(image)
 
 
-@pytest.mark.parametrize(
-    ("width", "height", "fps", "rate"),
-    [
-        (64, 48, 24, 24),
-        (63, 47, 29.97, Fraction(30000, 1001)),
-        (61, 43, 12.5, 12.5),
-    ],
-)
+@pytest.mark.parametrize(("width", "height", "fps", "rate"), [(64, 48, 24, 24), (63, 47, 29.97, Fraction(30000, 1001))])
 def test_every_image_comes_back_at_its_rate_odd_sides_gain_one_and_the_index_is_in_front(
     tmp_path: Path, width: int, height: int, fps: float, rate: Fraction
 ) -> None:
@@ -217,7 +218,7 @@ def test_every_image_comes_back_at_its_rate_odd_sides_gain_one_and_the_index_is_
     found = video_of(path)
     assert len(found) == 9
     for image, given in zip(found, images, strict=True):
-        assert decibels(image[:height, :width], given / 255) > 35
+        assert psnr(image[:height, :width] / 255, given / 255) > 35
     data = path.read_bytes()
     assert data.index(b"moov") < data.index(b"mdat"), "a browser can begin before it has the whole file"
 
@@ -229,15 +230,6 @@ def test_an_animated_webp_keeps_number_and_odd_size(tmp_path: Path) -> None:
     assert (data[:4], data[8:12], data.count(b"ANMF")) == (b"RIFF", b"WEBP", 5)
     at = data.index(b"VP8X") + 12
     assert [int.from_bytes(data[at + i : at + i + 3], "little") for i in (0, 3)] == [60, 42]
-
-
-def test_pngs_are_exact(tmp_path: Path) -> None:
-    images = soft(3, 31, 17)
-    write(tmp_path / "video", images, form="png")
-    paths = sorted((tmp_path / "video").iterdir())
-    assert [path.name for path in paths] == ["00000.png", "00001.png", "00002.png"]
-    for path, image in zip(paths, images, strict=True):
-        assert np.array_equal(read_image(path), image)
 
 
 def test_a_video_that_fails_leaves_what_was_there_and_nothing_else(tmp_path: Path) -> None:

@@ -36,17 +36,14 @@ def test_a_look_is_the_backbones_own_render(backbone: str, background: bool) -> 
     assert not seen.depth[~solid].any()
 
 
-@pytest.mark.parametrize("maker", [fudan, deformable3d, spacetime], ids=["fudan", "deformable3d", "spacetime"])
-def test_the_colours_of_official_trainers_are_those_they_render(maker) -> None:
-    if maker is spacetime:
-        gaussians = spacetime.make()[0]
-        adapter = SpacetimeAdapter(gaussians, 10)
-    elif maker is fudan:
-        gaussians = fudan.make()[0]
-        adapter = FudanAdapter(gaussians)
-    else:
-        gaussians, deform = deformable3d.make()[:2]
-        adapter = Deformable3DAdapter(gaussians, deform)
+ADAPTERS = {"fudan": FudanAdapter, "deformable3d": Deformable3DAdapter, "spacetime": SpacetimeAdapter}
+MAKERS = {"fudan": fudan.make, "deformable3d": deformable3d.make, "spacetime": lambda: (spacetime.make()[0], 10)}
+
+
+@pytest.mark.parametrize("name", list(ADAPTERS))
+def test_the_colours_of_official_trainers_are_those_they_render(name: str) -> None:
+    gaussians, *more = MAKERS[name]()
+    adapter = ADAPTERS[name](gaussians, *more[: name != "fudan"])
     splats = adapter.slice_at(VIEW)
     assert torch.allclose(adapter.colors(VIEW, splats), gaussians.rgb[splats.rows].clamp(min=0), atol=1e-6)
 

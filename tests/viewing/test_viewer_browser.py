@@ -5,14 +5,14 @@ from __future__ import annotations
 import socket
 import threading
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 from tiny import ALL_HOOKS, make_trainer
-from viewing.chromium import Page, browser, executable
-from viewing.showing import showing
+from viewing.chromium import Page, browser, decoded, executable
 
 from d2_plugin.viewing.live import Viewer
 from d2_plugin.viewing.viewed import KeptImages, ViewedRun
@@ -31,6 +31,21 @@ def new_page() -> Iterator[Callable[[], Page]]:
         yield new
 
 
+@contextmanager
+def showing(viewed: ViewedRun) -> Iterator[Viewer]:
+    """A viewer whose images are drawn by a thread of its own, as `d2 view` draws them in its only one."""
+    viewer, stop = Viewer(viewed=viewed, port=18080, height=180), threading.Event()
+    thread = threading.Thread(target=viewer.stay, args=(stop.is_set,))
+    thread.start()
+    try:
+        yield viewer
+        assert thread.is_alive(), "what draws has stopped"
+    finally:
+        stop.set()
+        thread.join()
+        viewer.close()
+
+
 def opened(new_page: Callable[[], Page], viewer: Viewer) -> Page:
     page = new_page().open(viewer.url)
     page.page.get_by_text("Recording", exact=True).wait_for(timeout=60_000)
@@ -38,10 +53,8 @@ def opened(new_page: Callable[[], Page], viewer: Viewer) -> Page:
 
 
 def image(page: Page) -> np.ndarray:
-    """What the page shows, RGB [H, W, 3]."""
-    cv2 = pytest.importorskip("cv2")
-    data = np.frombuffer(page.page.screenshot(clip=FREE), np.uint8)
-    return cv2.imdecode(data, cv2.IMREAD_COLOR)[..., ::-1].astype(float)
+    """What the page shows, [H, W, 3]."""
+    return decoded(page.page.screenshot(clip=FREE)).astype(float)
 
 
 def until(page: Page, condition: Callable[[np.ndarray], bool], seconds: float = 30) -> np.ndarray:
@@ -90,7 +103,7 @@ def choose(page: Page, label: str, option: str) -> None:
 def test_a_person_moves_camera_and_time_while_another_only_looks(
     new_page: Callable[[], Page], viewed: ViewedRun
 ) -> None:
-    with showing(viewed, 180) as viewer:
+    with showing(viewed) as viewer:
         one, two = opened(new_page, viewer), opened(new_page, viewer)
         first, other = settled(one), settled(two)
         assert viewer.clients == 2
@@ -115,7 +128,7 @@ def test_a_person_moves_camera_and_time_while_another_only_looks(
 
 @pytest.mark.slow
 def test_depth_opacity_and_the_prior_as_points(new_page: Callable[[], Page], viewed: ViewedRun) -> None:
-    with showing(viewed, 180) as viewer:
+    with showing(viewed) as viewer:
         page = opened(new_page, viewer)
         before = settled(page)
         for show in ("depth", "opacity"):
@@ -136,9 +149,8 @@ def test_names_stay_text_and_only_this_machine_may_look(new_page: Callable[[], P
     cameras = {EVIL if name == "train0" else name: camera for name, camera in viewed.recording.cameras.items()}
     recording = replace(viewed.recording, cameras=cameras, source=KeptImages(cameras))
     named = replace(viewed, name=EVIL, recording=recording, train_cameras=tuple(cameras), store=None, test_cameras=())
-    with showing(named, 180) as viewer:
+    with showing(named) as viewer:
         page = opened(new_page, viewer)
-        settled(page)
         assert control(page, "shown").input_value() == EVIL
         control(page, "stand at").click()
         page.page.get_by_role("option", name=EVIL, exact=True).wait_for()

@@ -21,7 +21,6 @@ from d2_plugin.viewing.export.coded import encode, seen_rows
 from d2_plugin.viewing.export.export import Export, write_export
 from d2_plugin.viewing.export.keys import STILL, bake, cholesky, morton_order, state_at
 from d2_plugin.viewing.export.page import to_json, write_page
-from d2_plugin.viewing.export.scene import ExportScene
 
 TIMES = (0.0, 0.13, 0.5)
 
@@ -186,32 +185,23 @@ class TestOthersReadIt:
         with pytest.raises(D2Error, match="this model moves by a network: choose --format html or ply"):
             write_export([make_scene(sharp_model("deform"))], Export((Path(),), "4dgs"), tmp_path)
 
-    @pytest.mark.parametrize("kind", ["sog", "spz"])
-    def test_what_splat_transform_writes_it_reads(self, tmp_path: Path, kind: str) -> None:
-        [path, _] = self.converted(tmp_path, kind)
-        back = tmp_path / "back.ply"
-        done = subprocess.run(["splat-transform", "-q", "-w", str(path), str(back)], capture_output=True, check=False)
-        assert done.returncode == 0
-        read, scene = read_still_ply(back), make_scene(sharp_model("yang4d"))
-        self.same(scene, scene.still_at(scene.seconds[1])[0], read.positions, read.opacities)
-
-    def test_fourdgs_reads_the_gltf(self, tmp_path: Path) -> None:
-        fourdgs = pytest.importorskip("fourdgs", reason="fourdgs is in the `formats` extra")
-        [path, _] = self.converted(tmp_path, "glb")
-        read = fourdgs.from_gltf(str(path)).gaussians
-        scene = make_scene(sharp_model("yang4d"))
-        parts = (torch.from_numpy(np.asarray(part, np.float64)) for part in (read.positions, read.colors[:, 3]))
-        self.same(scene, scene.still_at(scene.seconds[1])[0], *parts)
-
-    @staticmethod
-    def converted(folder: Path, kind: str) -> list[Path]:
+    @pytest.mark.parametrize("kind", ["sog", "spz", "glb"])
+    def test_others_read_what_splat_transform_writes(self, tmp_path: Path, kind: str) -> None:
+        """All that is seen is there, up to a turn of the axes by half a circle."""
         if shutil.which("splat-transform") is None:
             pytest.skip("splat-transform is not on the PATH: npm install -g @playcanvas/splat-transform")
-        return write_export([make_scene(sharp_model("yang4d"))], Export((Path(),), kind, frames=(1, 5)), folder)[0]
-
-    @staticmethod
-    def same(scene: ExportScene, true: MovingGaussians, positions: torch.Tensor, opacities: torch.Tensor) -> None:
-        """All that is seen is there, up to a turn of the axes by half a circle."""
+        scene = make_scene(sharp_model("yang4d"))
+        [path, _], _ = write_export([scene], Export((Path(),), kind, frames=(1, 5)), tmp_path)
+        if kind == "glb":
+            fourdgs = pytest.importorskip("fourdgs", reason="fourdgs is in the `formats` extra")
+            found = fourdgs.from_gltf(str(path)).gaussians
+            parts = (torch.from_numpy(np.asarray(part, np.float64)) for part in (found.positions, found.colors[:, 3]))
+            positions, opacities = parts
+        else:
+            subprocess.run(["splat-transform", "-q", "-w", str(path), str(tmp_path / "back.ply")], check=True)
+            read = read_still_ply(tmp_path / "back.ply")
+            positions, opacities = read.positions, read.opacities
+        true = scene.still_at(scene.seconds[1])[0]
         kept = (true.opacities >= 1 / 255).nonzero()[:, 0]
         assert len(positions) == len(kept)
         turns = torch.tensor([[1.0, 1, 1], [1, -1, -1], [-1, -1, 1]]).double()
