@@ -119,11 +119,11 @@ def packed(full: Tensor) -> Tensor:
     return full[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
 
 
-def make_view(width: int, height: int, focal: float | None = None, principal: tuple | None = None) -> View:
+def make_view(width: int, height: int, focal: float | None = None) -> View:
     """A camera at the origin that looks along z."""
     focal = 0.85 * width if focal is None else focal
-    x, y = principal or (width / 2, height / 2)
-    return View("cam", 0, 0.0, torch.eye(4), torch.tensor([[focal, 0, x], [0, focal, y], [0, 0, 1.0]]), width, height)
+    K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+    return View("cam", 0, 0.0, torch.eye(4), K, width, height)
 
 
 def covariance(scales: Tensor, generator: torch.Generator) -> Tensor:

@@ -9,8 +9,9 @@ import os
 import signal
 import subprocess
 import sys
-import threading
+import time
 import zipfile
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -57,8 +58,8 @@ def test_what_is_read_is_what_was_written(tmp_path_factory: pytest.TempPathFacto
 
 @pytest.mark.parametrize(
     "content",
-    [b"", b"{", b"[1]", b"3", b"\xff\xfe\x00", b"[" * 200_000, b'{"a": ' + b"9" * 5000 + b"}", b'{"format": 3}'],
-    ids=["empty", "cut off", "a list", "a number", "no text", "too deep", "too long", "no seal"],
+    [b"", b"[1]", b"\xff\xfe\x00", b"[" * 200_000, b'{"format": 3}'],
+    ids=["empty", "a list", "no text", "too deep", "no seal"],
 )
 def test_what_is_no_table_is_one_sentence(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "table.json").write_bytes(content)
@@ -201,21 +202,18 @@ def test_many_may_write_beside_each_other_and_the_first_tidies(tmp_path: Path) -
 
 
 def test_turns_are_taken_one_after_the_other(tmp_path: Path) -> None:
-    inside, most = [], []
+    inside = []
 
-    def turn() -> None:
+    def turn(number: int) -> int:
         with in_turn(tmp_path):
-            inside.append(1)
-            most.append(len(inside))
-            threading.Event().wait(0.01)
+            inside.append(number)
+            time.sleep(0.01)
+            most = len(inside)
             inside.pop()
+            return most
 
-    threads = [threading.Thread(target=turn) for _ in range(6)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert most == [1] * 6
+    with ThreadPoolExecutor(6) as threads:
+        assert list(threads.map(turn, range(6))) == [1] * 6
 
 
 def test_a_folder_that_is_none_is_told(tmp_path: Path) -> None:

@@ -74,14 +74,3 @@ def test_every_package_that_doctor_names_is_in_the_extra_that_it_names(setup: co
 def test_every_extra_of_a_user_is_in_all(setup: configparser.ConfigParser) -> None:
     together = extras_in(setup["options.extras_require"]["all"])
     assert together == set(setup["options.extras_require"]) - {"all", "test", "cuda", "older"}
-
-
-def test_the_tables_that_contributing_names_are_there() -> None:
-    named = re.findall(r"`(\w+)` in `([\w/]+\.py)`", (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8"))
-    assert len(named) > 3
-    missing = [
-        f"{name} in {file}"
-        for name, file in named
-        if not (ROOT / file).exists() or name not in (ROOT / file).read_text()
-    ]
-    assert not missing

@@ -84,6 +84,15 @@ def make_model(
     return model
 
 
+def bend_field(model: SplatModel, strength: float = 0.02) -> SplatModel:
+    """The model, whose deformation field, where it has one, now moves its Gaussians."""
+    if getattr(model, "field", None) is not None:
+        with torch.no_grad():
+            for parameter in model.field.heads.parameters():
+                parameter.uniform_(-strength, strength, generator=torch.Generator().manual_seed(1))
+    return model
+
+
 def make_adapter(model: SplatModel) -> Yang4DAdapter | DeformAdapter:
     """The adapter of either bundled backbone."""
     return Yang4DAdapter(model) if isinstance(model, Yang4D) else DeformAdapter(model)
@@ -110,11 +119,8 @@ def make_trainer(
 
 
 def parameters(trainer: Trainer) -> dict[str, Tensor]:
-    """The model's parameters, those of a deformation field included, detached."""
-    model = trainer.model
-    field = getattr(model, "field", None)
-    named = dict(model.gaussians.parameters) | (dict(field.named_parameters(prefix="field")) if field else {})
-    return {name: value.detach().clone() for name, value in named.items()}
+    """All that is trained: Gaussians, and what the model has of a field, a background and gains of cameras."""
+    return {name: value.detach().clone() for name, value in make_adapter(trainer.model).trained().items()}
 
 
 def same(a: dict[str, Tensor], b: dict[str, Tensor]) -> bool:

@@ -17,6 +17,7 @@ from tiny import (
     BACKBONES,
     TinyFrames,
     TinyStore,
+    bend_field,
     is_finite,
     make_adapter,
     make_model,
@@ -30,7 +31,6 @@ from d2_plugin import D2Config, D2Error, D2Hooks
 from d2_plugin.backbones.densify import DensifySettings, grow, prune
 from d2_plugin.backbones.model import SplatModel
 from d2_plugin.backbones.starting import nearest_neighbour_scales
-from d2_plugin.backbones.trainer import Trainer, TrainSettings
 from d2_plugin.backbones.yang4d import create
 from d2_plugin.gaussians import spherical_harmonics as sh
 from d2_plugin.protocol import Backbone, Points
@@ -47,18 +47,9 @@ def backbone(request: pytest.FixtureRequest) -> str:
     return request.param
 
 
-def bend_field(model: SplatModel, strength: float = 0.02) -> None:
-    """A deformation field, where there is one, moves its Gaussians."""
-    if getattr(model, "field", None) is not None:
-        with torch.no_grad():
-            for parameter in model.field.heads.parameters():
-                parameter.uniform_(-strength, strength, generator=generator(1))
-
-
 def numbered(name: str) -> SplatModel:
     """A model of COUNT Gaussians whose colours, Adam moments and statistics hold their numbers 1, 2, 3, ..."""
-    model = make_model(COUNT, backbone=name)
-    bend_field(model)
+    model = bend_field(make_model(COUNT, backbone=name))
     sum((p * 0).sum() for p in model.gaussians.parameters.values()).backward()
     model.gaussians.optimizer.step()
     model.gaussians.optimizer.zero_grad()
@@ -138,22 +129,24 @@ def test_all_hooks_off_is_bitwise_the_bare_trainer(backbone: str, temporal: bool
     assert not same(bare, full), "the hooks changed nothing: this test could not fail"
 
 
-@pytest.mark.parametrize(("config", "count"), [(ALL_HOOKS, 1), (ALL_HOOKS, 2), (None, 1)])
+@pytest.mark.parametrize(("config", "count"), [(ALL_HOOKS, 2), (D2Config(), 1)])
 def test_a_resumed_run_is_bitwise_the_uninterrupted_one(
-    backbone: str, config: D2Config | None, count: int, threads: Callable[[int], None]
+    backbone: str, config: D2Config, count: int, threads: Callable[[int], None]
 ) -> None:
     threads(count)
-    whole, first = (make_trainer(config, backbone=backbone) for _ in range(2))
+    whole, first = (make_trainer(config, 20, backbone=backbone, appearance=True) for _ in range(2))
     whole.run()
-    first.run(until=17)
+    first.run(until=12)
     buffer = io.BytesIO()
     torch.save(first.state_dict(), buffer)
     buffer.seek(0)
-    second = make_trainer(config, backbone=backbone, seed=99)  # other Gaussians: all must come from the checkpoint
+    # Other Gaussians, and no background: all must come from the checkpoint.
+    second = make_trainer(config, 20, backbone=backbone, background=False, seed=99)
     second.load_state_dict(torch.load(buffer, weights_only=True))
     second.run()
     assert same(parameters(whole), parameters(second))
     assert is_finite(whole)
+    assert whole.model.appearance.change("cam0").abs().max() > 0
 
 
 def test_training_lowers_the_loss_of_the_tiny_scene(backbone: str) -> None:
@@ -165,15 +158,12 @@ def test_training_lowers_the_loss_of_the_tiny_scene(backbone: str) -> None:
 
 
 def test_without_time_these_are_ordinary_3d_gaussians(backbone: str) -> None:
-    trainer = make_trainer(temporal=False, backbone=backbone)
-    model = trainer.model
+    model = make_model(temporal=False, backbone=backbone)
     assert getattr(model, "field", None) is None
     assert {"times", "log_time_scales", "right"}.isdisjoint(model.gaussians.parameters)
     a, b = (model.slice_at(view) for view in (make_views()[0], make_views()[-1]))
     assert all(torch.equal(x, y) for x, y in zip(a, b, strict=True))
     assert len(a.rows) == 60
-    trainer.run()
-    assert is_finite(trainer)
 
 
 def test_a_time_that_is_not_a_number_is_refused(backbone: str) -> None:
@@ -230,9 +220,9 @@ class TestDensityControl:
             model.gaussians["log_scales"][30:] = math.log(0.1)
         model.gaussians.statistics["screen_gradient"][[0, 40]] = 1.0
         model.gaussians.statistics["seen"].fill_(1)
-        before = parameters_of(model)
+        before = {name: value.detach().clone() for name, value in model.gaussians.parameters.items()}
         grow(model, DensifySettings(gradient=0.5), torch.Generator().manual_seed(0))
-        after = parameters_of(model)
+        after = model.gaussians.parameters
         assert len(model) == 62, "one clone; one parent replaced by two children"
         assert torch.equal(after["positions"][-3], before["positions"][0])
         torch.testing.assert_close(after["log_scales"][-2:], before["log_scales"][[40, 40]] - math.log(1.6))
@@ -255,25 +245,15 @@ class TestDensityControl:
 
 
 def test_every_training_view_is_used_once_per_round() -> None:
-    trainer = make_trainer()
+    drawn, trainer = [], make_trainer()
+    trainer.model.accumulate = drawn.append
     count = len(TinyFrames().views)
-    assert sorted(trainer._next_view() for _ in range(count)) == list(range(count))
+    trainer.run(until=count)
+    assert {(view.camera, view.frame) for view in drawn} == {(view.camera, view.frame) for view in TinyFrames().views}
 
 
-@pytest.mark.parametrize("settings", [{}, {"sh_degree": 1, "sh_time_degree": 2}])
-@pytest.mark.parametrize("temporal", [True, False])
-def test_every_variant_trains_and_grows(settings: dict[str, object], temporal: bool) -> None:
-    points = torch.rand(3, 60, 3, generator=torch.Generator().manual_seed(0))
-    growth = {"start": 0.0, "stop": 1.0, "every": 7, "gradient": 1e-3}
-    model = create(
-        points[0] + torch.tensor([-0.5, -0.5, 2.5]), points[1], points[2, :, 0] / 2, extent=2.0, duration=0.5,
-        temporal=temporal, settings=settings | {"densify": growth},
-    )  # fmt: skip
-    trainer = Trainer(model, TinyFrames(), TrainSettings(iterations=30))
+def test_colours_of_direction_and_time_train_and_grow() -> None:
+    trainer = make_trainer(iterations=20, sh_degree=1, sh_time_degree=2)
     trainer.run()
     assert is_finite(trainer)
-    assert len(model) > 60
-
-
-def parameters_of(model) -> dict[str, torch.Tensor]:
-    return parameters(type("Holder", (), {"model": model})())
+    assert len(trainer.model) > 60

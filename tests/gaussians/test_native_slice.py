@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -43,50 +44,74 @@ def temporal(request: pytest.FixtureRequest) -> bool:
     return request.param
 
 
-def slice_with_gradients(slice_in, rows: Mapping[str, Tensor], dtype: torch.dtype, seed: int = 7, at: float = AT):
-    """Outputs, and gradients of a fixed random sum of them, of `slice_in` (native or torch) in `dtype`."""
+class Sliced(NamedTuple):
+    means: Tensor
+    covariances: Tensor
+    opacities: Tensor
+    rows: Tensor
+    gradients: dict[str, Tensor]
+
+    def assert_finite(self) -> None:
+        for name, tensor in (*zip(self._fields, self[:3]), *self.gradients.items()):
+            assert torch.isfinite(tensor).all(), name
+
+
+def sliced(
+    slice_in: Callable,
+    dtype: torch.dtype,
+    rows: Mapping[str, Tensor],
+    at: float = AT,
+    weighed: bool = True,
+    used: slice = slice(None),
+) -> Sliced:
+    """The slice by `slice_in`, and gradients of the sum of the outputs `used`, `weighed` by a fixed noise or not."""
     raw = {name: value.to(dtype, copy=True).requires_grad_() for name, value in rows.items()}
     *outputs, drawn = slice_in(raw, at, *CONSTANTS)
-    generator = torch.Generator().manual_seed(seed)
-    upstream = [torch.randn(output.shape, generator=generator).to(dtype) for output in outputs]
-    torch.autograd.backward(outputs, upstream)
-    return (*(o.detach() for o in outputs), drawn), {name: value.grad for name, value in raw.items()}
+    generator, upstream = torch.Generator().manual_seed(7), []
+    for output in outputs:  # a Gaussian has its noise, whichever others are drawn
+        noise = torch.randn(len(raw["positions"]), *output.shape[1:], generator=generator)
+        upstream.append(noise[drawn].to(dtype) if weighed else torch.ones_like(output))
+    torch.autograd.backward(outputs[used], upstream[used])
+    gradients = {name: torch.zeros_like(value) if value.grad is None else value.grad for name, value in raw.items()}
+    return Sliced(*(output.detach() for output in outputs), drawn, gradients)
+
+
+native = partial(sliced, native_slice, torch.float32)
+plain = partial(sliced, reference_slice, torch.float32)
+exact = partial(sliced, reference_slice, torch.float64)
 
 
 @needs_compiler
-@pytest.mark.parametrize("time_scale", [0.02, 0.5, 2.0])
-@pytest.mark.parametrize("count", [0, 1, 15, 16, 17, 1040, 3001])
+@pytest.mark.parametrize("time_scale", [0.02, 2.0])
+@pytest.mark.parametrize("count", [0, 1, 15, 16, 17, 3001])
 def test_values_and_gradients_are_those_of_torch_in_float64(count: int, time_scale: float, temporal: bool) -> None:
     rows = random_rows(count, temporal, count, time_scale)
-    native, native_gradients = slice_with_gradients(native_slice, rows, torch.float32)
-    exact, exact_gradients = slice_with_gradients(reference_slice, rows, torch.float64)
-    assert torch.equal(native[3], exact[3])
-    for name, value, expected in zip(OUTPUTS, native, exact):
+    found, expected = native(rows), exact(rows)
+    assert torch.equal(found.rows, expected.rows)
+    for value, other in zip(found[:3], expected):
         assert value.is_contiguous()
-        assert relative_error(value, expected) < 2e-6, name
-    for name, expected in exact_gradients.items():
-        assert relative_error(native_gradients[name], expected) < 1e-5, name
+        assert relative_error(value, other) < 2e-6
+    for name, other in expected.gradients.items():
+        assert relative_error(found.gradients[name], other) < 1e-5, name
 
 
 @needs_compiler
 def test_where_float32_is_short_of_digits_the_kernel_loses_no_more_than_torch() -> None:
     rows = random_rows(300, True, time_scale=200.0)  # velocities are ratios of numbers three orders apart
-    native, native_gradients = slice_with_gradients(native_slice, rows, torch.float32)
-    plain, plain_gradients = slice_with_gradients(reference_slice, rows, torch.float32)
-    exact, exact_gradients = slice_with_gradients(reference_slice, rows, torch.float64)
-    assert torch.equal(native[3], exact[3])
-    for name, value, other, expected in zip(OUTPUTS, native, plain, exact):
-        assert relative_error(value, expected) < 2e-6 + 1.5 * relative_error(other, expected), name
-    for name, expected in exact_gradients.items():
-        allowed = 2e-6 + 1.5 * relative_error(plain_gradients[name], expected)
-        assert relative_error(native_gradients[name], expected) < allowed, name
+    found, other, expected = native(rows), plain(rows), exact(rows)
+    assert torch.equal(found.rows, expected.rows)
+    for ours, theirs, right in zip(found[:3], other, expected):
+        assert relative_error(ours, right) < 2e-6 + 1.5 * relative_error(theirs, right)
+    for name, right in expected.gradients.items():
+        allowed = 2e-6 + 1.5 * relative_error(other.gradients[name], right)
+        assert relative_error(found.gradients[name], right) < allowed, name
 
 
 @needs_compiler
 def test_the_number_of_threads_changes_no_bit(temporal: bool, same_for_any_threads: Callable) -> None:
     def everything() -> list[Tensor]:
-        outputs, gradients = slice_with_gradients(native_slice, random_rows(10_000, temporal), torch.float32)
-        return [*outputs, *gradients.values()]
+        found = native(random_rows(10_000, temporal))
+        return [*found[:4], *found.gradients.values()]
 
     same_for_any_threads(everything)
 
@@ -96,40 +121,23 @@ def test_the_number_of_threads_changes_no_bit(temporal: bool, same_for_any_threa
 @pytest.mark.parametrize("value", [math.nan, math.inf])
 def test_nan_or_infinity_in_one_gaussian_leaves_the_others_untouched(spoilt: str, value: float) -> None:
     rows = random_rows(200, True, time_scale=20.0)
-    clean, clean_gradients = slice_with_gradients(native_slice, rows, torch.float32)
+    clean = native(rows)
     rows[spoilt].view(200, -1)[7, 0] = value
-    # The same upstream gradient for each Gaussian, whether or not the spoilt one is still drawn.
-    raw = {name: tensor.clone().requires_grad_() for name, tensor in rows.items()}
-    *outputs, drawn = native_slice(raw, AT, *CONSTANTS)
-    generator = torch.Generator().manual_seed(7)
-    upstream, places = (
-        [torch.randn(o.shape, generator=generator) for o in clean[:3]],
-        torch.searchsorted(clean[3], drawn),
-    )
-    torch.autograd.backward(outputs, [gradient[places] for gradient in upstream])
-    for output, expected in zip(outputs, clean):
-        assert torch.equal(output[drawn != 7], expected[clean[3] != 7])
+    found = native(rows)
+    for output, expected in zip(found[:3], clean):
+        assert torch.equal(output[found.rows != 7], expected[clean.rows != 7])
     others = torch.arange(200) != 7
-    for name, tensor in raw.items():
-        assert torch.equal(tensor.grad[others], clean_gradients[name][others]), name
+    for name, expected in clean.gradients.items():
+        assert torch.equal(found.gradients[name][others], expected[others]), name
 
 
 @needs_compiler
-def test_each_output_alone_has_its_gradient(temporal: bool) -> None:
-    rows = random_rows(40, temporal)
-    for output in range(3):
-        gradients = []
-        for slice_in, dtype in ((native_slice, torch.float32), (reference_slice, torch.float64)):
-            raw = {name: value.to(dtype, copy=True).requires_grad_() for name, value in rows.items()}
-            slice_in(raw, AT, *CONSTANTS)[output].square().sum().backward()
-            gradients.append({name: value.grad for name, value in raw.items()})
-        for name, expected in gradients[1].items():
-            found = gradients[0][name]
-            assert found is not None
-            if expected is None or not expected.any():
-                assert not found.any(), name
-            else:
-                assert relative_error(found, expected) < 5e-6, name
+@pytest.mark.parametrize("used", range(3), ids=OUTPUTS)
+def test_each_output_alone_has_its_gradient(temporal: bool, used: int) -> None:
+    rows, alone = random_rows(40, temporal), slice(used, used + 1)
+    found, expected = native(rows, used=alone), exact(rows, used=alone)
+    for name, gradient in expected.gradients.items():
+        assert relative_error(found.gradients[name], gradient) < 5e-6, name
 
 
 @needs_compiler
@@ -143,12 +151,9 @@ def test_rows_of_another_number_of_gaussians_are_refused() -> None:
 @needs_compiler
 def test_a_model_slices_in_torch_where_there_is_no_compiler(temporal: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     model, view = make_model(temporal=temporal), make_views()[-1]
-    native = model.slice_at(view)
-    assert "_Slice" in type(native.covariances.grad_fn).__name__
+    compiled = model.slice_at(view)
     monkeypatch.setattr(kernel, "library", lambda: None)
-    plain = model.slice_at(view)
-    assert "_Slice" not in type(plain.covariances.grad_fn).__name__
-    for one, other in zip(native, plain):
+    for one, other in zip(model.slice_at(view), compiled):
         torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-6)
 
 
@@ -171,42 +176,17 @@ def test_slice_agrees_with_the_reference_implementation(name: str) -> None:
         np.testing.assert_allclose(speed[:, 0], tensor(*velocity), atol=5e-9)
 
 
-PATHS = {
-    "kernel": (native_slice, torch.float32),
-    "torch, float32": (reference_slice, torch.float32),
-    "torch, float64": (reference_slice, torch.float64),
-}
+PATHS = {"kernel": native, "torch, float32": plain, "torch, float64": exact}
 
 IDENTITY = torch.tensor([1.0, 0, 0, 0])
-
-
-class Sliced(NamedTuple):
-    means: Tensor
-    covariances: Tensor
-    opacities: Tensor
-    rows: Tensor
-    gradients: dict[str, Tensor]
-
-    def assert_finite(self) -> None:
-        for name, tensor in (*zip(self._fields, self[:3]), *self.gradients.items()):
-            assert torch.isfinite(tensor).all(), name
 
 
 @pytest.fixture(params=list(PATHS))
 def take_slice(request: pytest.FixtureRequest) -> Callable[..., Sliced]:
     """Slice and differentiate the sum of all outputs, by one of the paths."""
-    slice_in, dtype = PATHS[request.param]
-    if slice_in is native_slice and kernel.library() is None:
+    if request.param == "kernel" and kernel.library() is None:
         pytest.skip("there is no C++ compiler")
-
-    def run(rows: Mapping[str, Tensor], at: float) -> Sliced:
-        raw = {name: value.to(dtype, copy=True).requires_grad_() for name, value in rows.items()}
-        *outputs, drawn = slice_in(raw, at, *CONSTANTS)
-        torch.autograd.backward(outputs, [torch.ones_like(output) for output in outputs])
-        gradients = {name: torch.zeros_like(value) if value.grad is None else value.grad for name, value in raw.items()}
-        return Sliced(*(output.detach() for output in outputs), drawn, gradients)
-
-    return run
+    return partial(PATHS[request.param], weighed=False)
 
 
 def axis_aligned(scales: tuple[float, float, float], time_scale: float, time: float = 0.0) -> dict[str, Tensor]:
@@ -222,7 +202,6 @@ def axis_aligned(scales: tuple[float, float, float], time_scale: float, time: fl
     }
 
 
-@pytest.mark.parametrize("temporal", [True, False])
 def test_a_zero_quaternion_is_the_identity_and_receives_no_gradient(take_slice, temporal: bool) -> None:
     rows = random_rows(40, temporal, time_scale=20.0)
     sides = ("left", "right") if temporal else ("left",)
@@ -240,8 +219,7 @@ def test_a_zero_quaternion_is_the_identity_and_receives_no_gradient(take_slice, 
         assert expected.gradients[side][3].any()
 
 
-@pytest.mark.parametrize("norm", [1e-20, 1e-6, 1e6, 1e20])
-@pytest.mark.parametrize("temporal", [True, False])
+@pytest.mark.parametrize("norm", [1e-20, 1e6, 1e20])
 def test_the_norm_of_a_quaternion_changes_nothing_but_its_gradient(take_slice, temporal: bool, norm: float) -> None:
     rows = random_rows(40, temporal, time_scale=20.0)
     sides = ("left", "right") if temporal else ("left",)
@@ -264,7 +242,6 @@ def test_quaternions_in_half_precision_have_length_one(norm: float) -> None:
     torch.testing.assert_close(unit.norm(dim=0), torch.ones(1, dtype=torch.float16), atol=2e-3, rtol=0)
 
 
-@pytest.mark.parametrize("temporal", [True, False])
 def test_gradients_include_the_normalisation_of_quaternions(temporal: bool) -> None:
     rows = {name: value.double() for name, value in random_rows(3, temporal, time_scale=5.0).items()}
     for side, norm in (("left", 0.3), ("right", 3.0)):
@@ -301,15 +278,15 @@ def test_a_vanishing_temporal_variance_at_its_own_instant_is_fully_there(take_sl
     assert found.gradients["opacity_logits"].tolist() == [0.25]
 
 
-@pytest.mark.parametrize("offset", [1e-6, 1.0, 1e9, 1e30])
+@pytest.mark.parametrize("offset", [1e-6, 1.0, 1e30])
 def test_a_vanishing_temporal_variance_at_another_instant_is_not_there(take_slice, offset: float) -> None:
     found = take_slice(axis_aligned((0.1, 0.1, 0.1), 1e-38), offset)
     assert len(found.rows) == 0
     assert all(not gradient.any() for gradient in found.gradients.values())
 
 
-@pytest.mark.parametrize("deviations", [0.0, 1.0, 2.4])
-@pytest.mark.parametrize("variance", [1e-20, 1e-10, 1.0, 1e10, 1e20])
+@pytest.mark.parametrize("deviations", [0.0, 2.4])
+@pytest.mark.parametrize("variance", [1e-20, 1.0, 1e20])
 def test_the_marginal_depends_on_standard_deviations_alone(take_slice, variance: float, deviations: float) -> None:
     sigma = math.sqrt(variance)
     found = take_slice(axis_aligned((0.1, 0.1, 0.1), sigma, time=-deviations * sigma), 0.0)

@@ -16,7 +16,7 @@ from d2_plugin.gaussians import native_ssim as kernel
 from d2_plugin.gaussians.photometric import photometric_loss, reference_photometric_loss
 from d2_plugin.protocol import Render, View
 
-SIZES = [(1, 1), (1, 40), (40, 1), (5, 7), (10, 12), (11, 11), (37, 23), (90, 61), (150, 160)]
+SIZES = [(1, 1), (1, 40), (40, 1), (11, 11), (37, 23), (150, 160)]
 
 
 @pytest.fixture(autouse=True)
@@ -43,8 +43,8 @@ def loss_with_gradient(
 
 @pytest.mark.parametrize(
     ("shape", "weight"),
-    [*(((*size, 3), 0.2) for size in SIZES), *(((20, 30, channels), 0.2) for channels in (1, 2, 4))]
-    + [((20, 30, 3), weight) for weight in (1e-3, 0.5, 1.0)],
+    [*(((*size, 3), 0.2) for size in SIZES), *(((20, 30, channels), 0.2) for channels in (1, 4))]
+    + [((20, 30, 3), weight) for weight in (1e-3, 1.0)],
 )
 @pytest.mark.parametrize("transposed", [False, True], ids=["", "transposed"])
 def test_value_and_gradient_are_those_of_torch_in_float64(
@@ -86,11 +86,6 @@ def test_the_structural_part_is_that_of_scikit_image() -> None:
         data_range=1.0, channel_axis=-1, gaussian_weights=True, sigma=1.5, use_sample_covariance=False, full=True,
     )[1].mean()  # fmt: skip
     np.testing.assert_allclose(1 - photometric_loss(image, target, 1.0), expected, rtol=1e-6)
-
-
-@pytest.mark.parametrize("height", [63, 64, 131])
-def test_the_number_of_threads_changes_no_bit(height: int, same_for_any_threads: Callable) -> None:
-    same_for_any_threads(lambda: loss_with_gradient(*images(height, 50)))
 
 
 def test_a_nan_pixel_spoils_only_its_surroundings() -> None:
@@ -176,9 +171,13 @@ def test_the_background_and_its_gradients_are_those_of_torch_in_float64(width: i
         assert (found - exact).norm() <= 3e-6 * exact.norm() + 1e-6
 
 
-def test_the_number_of_threads_changes_no_bit_of_the_background(same_for_any_threads: Callable) -> None:
-    sizes = (100, 70), (320, 180), (41, 23)
-    same_for_any_threads(lambda: [part for size in sizes for part in behind(*size, torch.float32)])
+def test_the_number_of_threads_changes_no_bit(same_for_any_threads: Callable) -> None:
+    def everything() -> list[Tensor]:
+        losses = [part for height in (63, 64, 131) for part in loss_with_gradient(*images(height, 50))]
+        sizes = (100, 70), (320, 180), (41, 23)
+        return losses + [part for size in sizes for part in behind(*size, torch.float32)]
+
+    same_for_any_threads(everything)
 
 
 def test_a_background_that_is_nan_is_seen() -> None:

@@ -1,4 +1,4 @@
-// The kernels of gpu.cu and the CUDA driver that launches them, as a library of the CPU; see cuda_shim.h and test_rasterizer_cuda.py.
+// The kernels of gpu.cu and the CUDA driver that launches them, as a library of the CPU; see cuda_shim.h.
 #include "cuda_shim.h"
 
 #include <string>

@@ -3,8 +3,9 @@
 //
 // A fibre runs until it must wait for the others of its warp (shuffles, votes) or of its block (barriers). What hardware
 // leaves open is a choice here: `order` runs blocks, warps and lanes as they are numbered (0), in the opposite order (1),
-// or in a new random order every time (any other number is its seed), so that code whose result depends on it shows it. A barrier that not all threads reach is an error, not a hang. Not covered: memory
-// shared between blocks that run at the same time, and the order in which the warps of real hardware interleave.
+// or in a new random order every time (any other number is its seed), so that code whose result depends on it shows it.
+// A barrier that not all threads reach is an error, not a hang. Not covered: memory shared between blocks that run at
+// the same time, and the order in which the warps of real hardware interleave.
 #pragma once
 
 #include <cmath>

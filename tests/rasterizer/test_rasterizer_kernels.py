@@ -7,11 +7,9 @@ from __future__ import annotations
 
 import functools
 import os
-import subprocess
-import sys
-import threading
 import warnings
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path as File
 
 import pytest
@@ -47,7 +45,7 @@ REFERENCE = Path(torch.float64)
 
 def behind() -> Scene:
     """Some Gaussians behind a turned camera, some beside the image."""
-    scene = random_scene(6, 200, 64, 48)
+    scene = random_scene(6, 200, 40, 40)
     scene.means[::20] *= -1
     scene.means[1::20, 0] += 100
     return scene.turned()
@@ -55,24 +53,21 @@ def behind() -> Scene:
 
 def layers(count: int, opacity: float) -> Scene:
     """Many over each tile: several batches of the forward pass and of the backward."""
-    scene = random_scene(7, count, 33, 17, radius=60.0)
+    scene = random_scene(7, count, 17, 16, radius=60.0)
     return scene._replace(opacities=torch.full_like(scene.opacities, opacity))
 
 
 SCENES = {
-    "small Gaussians": lambda: random_scene(0, 250, 61, 37),
-    "a third of a pixel": lambda: random_scene(3, 200, 50, 37, radius=0.3),
-    "large Gaussians, early finish": lambda: random_scene(1, 150, 70, 40, radius=40.0),
+    "small Gaussians": lambda: random_scene(0, 200, 49, 37),
+    "a third of a pixel": lambda: random_scene(3, 200, 33, 37, radius=0.3),
+    "large Gaussians, early finish": lambda: random_scene(1, 120, 50, 30, radius=40.0),
     "a turned camera, some behind it": behind,
     "many opaque layers": lambda: layers(700, 0.97),
     "many faint layers": lambda: layers(600, 0.006),
-    "one channel": lambda: random_scene(2, 200, 40, 40, channels=1),
-    "two channels": lambda: random_scene(2, 200, 40, 40, channels=2),
-    "five channels": lambda: random_scene(3, 200, 33, 66, channels=5),
+    "one channel": lambda: random_scene(2, 100, 33, 20, channels=1),
+    "five channels": lambda: random_scene(3, 100, 20, 33, channels=5),
     "forty channels": lambda: random_scene(3, 40, 33, 20, channels=40),
     "one pixel": lambda: random_scene(4, 30, 1, 1),
-    "7x5": lambda: random_scene(5, 50, 7, 5),
-    "one Gaussian": single,
 }
 
 PLAIN, SMOOTH = RasterSettings(), RasterSettings(antialiased=True)
@@ -112,9 +107,7 @@ def exact_gradients(name: str, settings: RasterSettings, edge: bool) -> tuple[Re
     return with_gradients(scene, REFERENCE, edge, settings, calm)
 
 
-@pytest.mark.parametrize(
-    ("settings", "edge"), [(PLAIN, False), (PLAIN, True), (SMOOTH, True)], ids=["", "edge", "antialiased-edge"]
-)
+@pytest.mark.parametrize(("settings", "edge"), [(PLAIN, False), (SMOOTH, True)], ids=["", "antialiased-edge"])
 @pytest.mark.parametrize("name", SCENES)
 def test_image_and_gradients_are_the_references(kernels: Path, name: str, settings: RasterSettings, edge: bool) -> None:
     scene, calm = calm_scene(name, settings)
@@ -173,62 +166,27 @@ def everything(scene: Scene, path: Path = Path(torch.float32)) -> list[torch.Ten
     return [part.detach().to(CPU) for part in (*render, *gradients, *surveys[0], *surveys[1])]
 
 
-def test_two_runs_give_the_same_bits(kernels: Path) -> None:
-    scene = random_scene(0, 250, 61, 37)
-    assert all(torch.equal(*pair) for pair in zip(everything(scene, kernels), everything(scene, kernels)))
-
-
 def test_the_number_of_threads_changes_no_bit(same_for_any_threads: Callable) -> None:
-    scene = random_scene(7, 3000, 150, 110)
+    scene = random_scene(7, 2000, 150, 70)
     same_for_any_threads(lambda: everything(scene))
 
 
 def test_the_order_of_blocks_warps_and_lanes_changes_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
-    scene, results = random_scene(8, 400, 45, 37, radius=12.0), []
-    for order in range(4):  # as they are numbered, in the opposite order, at random
-        launcher = ShimLauncher(order)
-        use_shim(monkeypatch, launcher)
+    scene, results = random_scene(8, 200, 45, 37, radius=12.0), []
+    for order in range(3):  # as they are numbered, in the opposite order, at random
+        use_shim(monkeypatch, launcher := ShimLauncher(order))
         results.append(everything(scene))
-        named = {"d2_project", "d2_list", "d2_render_front", "d2_backward_front", "d2_survey_front"}
-        assert named <= launcher.launched
+        assert {"d2_backward_front", "d2_survey_front"} <= launcher.launched
     for other in results[1:]:
-        assert all(torch.equal(a, b) for a, b in zip(results[0], other))
+        assert all(torch.equal(*pair) for pair in zip(results[0], other))
 
 
 def test_calls_from_several_python_threads_do_not_disturb_each_other() -> None:
     scenes = [random_scene(seed, 500, 80, 60) for seed in range(3)]
     expected = [everything(scene) for scene in scenes]
-    found: dict[int, list] = {}
-
-    def work(index: int) -> None:
-        for _ in range(3):
-            found[index] = everything(scenes[index])
-
-    workers = [threading.Thread(target=work, args=(index,)) for index in range(3)]
-    for worker in workers:
-        worker.start()
-    for worker in workers:
-        worker.join()
-    for index, parts in found.items():
-        assert all(torch.equal(part, other) for part, other in zip(parts, expected[index]))
-
-
-FORK = """
-import os, torch
-from splat_scenes import Path, random_scene
-scene = random_scene(0, 500, 80, 60).on(Path(torch.float32))
-before = scene.render().color
-child = os.fork()
-if child == 0:
-    os._exit(0 if torch.equal(scene.render().color, before) else 1)
-assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
-"""
-
-
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
-def test_a_forked_process_can_still_render() -> None:
-    environment = {**os.environ, "PYTHONPATH": str(File(__file__).parents[1])}
-    subprocess.run([sys.executable, "-c", FORK], check=True, env=environment, timeout=120)
+    with ThreadPoolExecutor(3) as threads:
+        for parts, others in zip(threads.map(everything, scenes * 3), expected * 3):
+            assert all(torch.equal(*pair) for pair in zip(parts, others))
 
 
 @pytest.fixture(params=["-march=x86-64-v3", "-march=x86-64"])
@@ -245,7 +203,7 @@ def other_instructions(request: pytest.FixtureRequest, monkeypatch: pytest.Monke
 
 
 def test_other_instruction_sets_agree_with_the_reference(other_instructions: Path) -> None:
-    for name in ("one channel", "one pixel", "one Gaussian", "five channels", "7x5"):
+    for name in ("one channel", "one pixel", "five channels"):
         for settings in (PLAIN, SMOOTH):
             test_image_and_gradients_are_the_references(other_instructions, name, settings, settings is SMOOTH)
             test_survey_is_the_references(other_instructions, name, settings)

@@ -20,14 +20,14 @@ SETTINGS, SMOOTH = RasterSettings(), RasterSettings(antialiased=True)
 TRUSTED = (Label.VERIFIED, Label.AGREED)
 
 
-@pytest.mark.parametrize("size", [(37, 41), (1, 1), (7, 5), (64, 1)])
+@pytest.mark.parametrize("size", [(37, 41), (1, 1), (64, 1)])
 @pytest.mark.parametrize(
     ("settings", "radius"),
     [(SETTINGS, 3.0), (RasterSettings(1.5, 1.0, 0.8, 0.02, 0.05, 0.7), 3.0), (SMOOTH, 0.7)],
     ids=["", "others", "antialiased"],
 )
 def test_image_is_the_compositing_sum_of_the_definition(size, settings, radius) -> None:
-    scene = random_scene(sum(size), 150, *size, radius=radius)
+    scene = random_scene(sum(size), 120, *size, radius=radius).turned()
     edge, background = near_edge_of(scene.view), torch.tensor([0.2, 0.4, 0.8], dtype=torch.float64)
     found, render = brute_force(scene, settings), scene.render(settings, background=background, near_edge=edge)
     alpha = found.weights.sum(0)
@@ -68,12 +68,6 @@ def test_survey_sums_the_weights_of_the_definition(weighed, settings) -> None:
     assert statistics.front.sum() > 0.1, "some stand in free space"
 
 
-def test_a_moved_world_gives_the_same_image() -> None:
-    scene = random_scene(5, 80, 24, 20)
-    for part, other in zip(scene.render()[:3], scene.turned().render()[:3]):
-        torch.testing.assert_close(part, other, atol=1e-10, rtol=0)
-
-
 def test_screen_offsets_move_the_image_by_pixels() -> None:
     scene = single(size=21)
     shift = torch.tensor([[2.0, -3.0]], dtype=torch.float64)
@@ -103,10 +97,10 @@ def test_antialiased_a_gaussian_without_area_has_the_least_opacity_and_no_gradie
 
 
 @pytest.mark.parametrize("settings", [SETTINGS, SMOOTH], ids=["", "antialiased"])
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(3))
 def test_gradients_are_those_of_the_image(seed, settings) -> None:
-    width, height = (4, 3) if seed == 0 else (7, 5)
-    scene = random_scene(seed, 4, width, height, 2, 0.5 if seed % 3 == 2 else 2.0).requires_grad()
+    width, height = (3, 2) if seed == 0 else (6, 4)
+    scene = random_scene(seed, 4, width, height, 2, 0.5 if seed == 2 else 2.0).requires_grad()
     background = torch.rand(2, dtype=torch.float64, generator=torch.Generator().manual_seed(seed)).requires_grad_()
     offsets = torch.zeros(4, 2, dtype=torch.float64, requires_grad=True)
 
@@ -115,14 +109,9 @@ def test_gradients_are_those_of_the_image(seed, settings) -> None:
         options = {"background": background, "screen_offsets": offsets, "near_edge": near_edge_of(scene.view, seed)}
         return tuple(rasterize(splats, colors, scene.view, settings, **options))
 
-    # Every entry of the Jacobian for one seed, a random projection of it (a tenth of the time) for the others.
-    assert gradcheck(render, (*scene[:4], background, offsets), fast_mode=seed > 0), f"seed {seed}"
-
-
-def bad(scene: Scene, **changes: object) -> tuple:
-    values = {**scene._asdict(), "settings": SETTINGS, "background": None, "screen_offsets": None, **changes}
-    splats = Splats(values["means"], values["covariances"], values["opacities"], torch.arange(1))
-    return splats, values["colors"], values["view"], values["settings"], values["background"], values["screen_offsets"]
+    # Every entry of the Jacobian once, a random projection of it (a tenth of the time) for the others.
+    every = seed == 0 and settings is SMOOTH
+    assert gradcheck(render, (*scene[:4], background, offsets), fast_mode=not every)
 
 
 @pytest.mark.parametrize(
@@ -141,9 +130,10 @@ def bad(scene: Scene, **changes: object) -> tuple:
     ],
 )
 def test_what_does_not_fit_together_is_named(changes, message) -> None:
-    splats, colors, view, settings, background, offsets = bad(single(), **changes)
+    of_scene = {name: value for name, value in changes.items() if name in Scene._fields}
+    options = {name: value for name, value in changes.items() if name not in of_scene}
     with pytest.raises(D2Error, match=message):
-        rasterize(splats, colors, view, settings, background=background, screen_offsets=offsets)
+        single()._replace(**of_scene).render(**options)
 
 
 @pytest.mark.parametrize(
@@ -203,17 +193,6 @@ def test_where_nothing_is_known_front_is_zero_without_gradient(path: Path) -> No
     assert not survey(scene.splats, scene.view, prior_of(scene.view), near_edge=edge).front.any()
 
 
-def test_a_loss_that_sends_nan_where_nothing_is_known_spoils_no_gradient(path: Path) -> None:
-    scene = random_scene(3, 40, 20, 20).on(path).requires_grad()
-    edge = near_edge_of(scene.view)
-    known = edge.isfinite() & (edge > 1e-30)
-    front = scene.render(near_edge=edge).front
-    (front / known.to(front))[known].sum().backward()
-    for part in scene[:3]:
-        assert part.grad.isfinite().all()
-        assert part.grad.any()
-
-
 def test_edges_of_nine_decades_in_one_image(path: Path) -> None:
     scene = random_scene(4, 200, 40, 30).on(path).requires_grad()
     edge = everywhere(scene, 1e-3)
@@ -236,18 +215,6 @@ def test_a_near_edge_changes_no_bit_of_anything_else(path: Path) -> None:
         assert statistics.front.any() == (edge is not None)
         results.append([*render[:3], *gradients, *statistics[:6]])
     assert all(torch.equal(part, other) for part, other in zip(*results))
-
-
-def test_without_a_map_reliability_is_one_where_the_prior_is_trusted(path: Path) -> None:
-    scene = random_scene(3, 120, 36, 34).on(path)
-    prior = prior_of(scene.view)
-    stated = prior._replace(reliability=prior.trusted.float())
-    one, two = (survey(scene.splats, scene.view, which) for which in (prior, stated))
-    assert all(torch.equal(part, other) for part, other in zip(one, two))
-    half = survey(scene.splats, scene.view, prior._replace(reliability=0.5 * prior.trusted))
-    for name in ("weight", "error"):
-        torch.testing.assert_close(2 * getattr(half, name), getattr(one, name))
-    assert torch.equal(half.hits, one.hits)
 
 
 def test_the_near_edge_of_a_prior_is_k_sigmas_before_its_depth() -> None:

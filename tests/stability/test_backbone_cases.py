@@ -17,6 +17,7 @@ from tiny import (
     WIDTH,
     TinyFrames,
     TinyStore,
+    bend_field,
     make_adapter,
     make_model,
     make_views,
@@ -37,12 +38,7 @@ DEPTH_LOSS = D2Config(depth_loss=DepthLossConfig(start=1, every=1))
 @pytest.fixture(params=BACKBONES)
 def model(request: pytest.FixtureRequest) -> SplatModel:
     """A model of each kind, past its warm-up, whose field, where it has one, moves things."""
-    model = make_model(backbone=request.param)
-    if getattr(model, "field", None) is not None:
-        with torch.no_grad():
-            for parameter in model.field.heads.parameters():
-                parameter.uniform_(-0.02, 0.02, generator=torch.Generator().manual_seed(1))
-    return model
+    return bend_field(make_model(backbone=request.param))
 
 
 class Store:
@@ -75,10 +71,7 @@ def with_bad_pixels(bad: float) -> Store:
 
 
 def gradients(model: SplatModel) -> dict[str, torch.Tensor]:
-    named = dict(model.gaussians.parameters)
-    if getattr(model, "field", None) is not None:
-        named |= dict(model.field.named_parameters())
-    return {name: p.grad for name, p in named.items() if p.grad is not None}
+    return {name: p.grad for name, p in make_adapter(model).trained().items() if p.grad is not None}
 
 
 def step(model: SplatModel, view_index: int = 0, time: float | None = None) -> torch.Tensor:
@@ -96,27 +89,24 @@ def step(model: SplatModel, view_index: int = 0, time: float | None = None) -> t
 
 
 def assert_finite(model: SplatModel) -> None:
-    for name, parameter in model.gaussians.parameters.items():
+    for name, parameter in make_adapter(model).trained().items():
         assert torch.isfinite(parameter).all(), name
-
-
-TRUSTED = (Label.VERIFIED, Label.AGREED)
 
 
 @pytest.mark.parametrize("label", Label)
 def test_case_25_and_34_trusted_pixels_alone_supervise_and_judge_whatever_the_threshold(
     model: SplatModel, label: Label
 ) -> None:
-    prune = PruneConfig(start=1, every=1, patience=1, tau_p=0.0)
+    prune, trusted = PruneConfig(start=1, every=1, patience=1, tau_p=0.0), label in (Label.VERIFIED, Label.AGREED)
     config = replace(DEPTH_LOSS, prune=prune, views_per_evaluation=6)
     d2 = D2Hooks(config, make_adapter(model), unlabelled(label))
     for view in make_views():
         model.render(view)
         loss = d2.loss(1, view)
         if label is not Label.FAR:  # which pulls from the front
-            assert (loss > 0) == (label in TRUSTED)
+            assert (loss > 0) == trusted
     removed = [d2.step(number).removed for number in range(2, 6)]
-    assert (removed[0] > 0) == any(removed) == (label in TRUSTED)
+    assert (removed[0] > 0) == any(removed) == trusted
 
 
 def test_case_25_where_nothing_is_rendered_the_depth_loss_is_zero_with_zero_gradients(model: SplatModel) -> None:
@@ -160,7 +150,7 @@ def test_case_27_bad_pixels_of_a_prior_reach_neither_loss_nor_gradient(model: Sp
 
 
 @pytest.mark.parametrize("offset", [0.0, 1e-6, 0.1, None], ids=["there", "beside", "away", "in deviations"])
-@pytest.mark.parametrize("variance", [1e-40, 1e-20, 1e-10, 1e10, 1e20])
+@pytest.mark.parametrize("variance", [1e-40, 1e-10, 1e20])
 def test_case_28_and_29_training_survives_any_temporal_variance(variance: float, offset: float | None) -> None:
     model = make_model()
     with torch.no_grad():
