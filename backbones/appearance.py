@@ -60,10 +60,11 @@ class Appearance:
         mean = torch.stack([value.detach() for value in self.changes.values()]).mean(0)
         return self.changes[camera] - mean
 
-    def optimize(self) -> None:
-        """One optimizer step of the cameras that have a gradient, gradients cleared."""
+    def optimize(self, share: float = 1.0) -> None:
+        """One optimizer step of the cameras that have a gradient at this share of the rate, gradients cleared."""
         for camera, value in self.changes.items():
             if value.grad is not None:
+                self._optimizers[camera].param_groups[0]["lr"] = share * RATE
                 self._optimizers[camera].step()
                 self._optimizers[camera].zero_grad(set_to_none=True)
 

@@ -82,10 +82,12 @@ class Background:
         fine = _refined(_refined(nodes, stride).transpose(1, 2), stride).transpose(1, 2)
         return fine[:, : view.height, : view.width].permute(1, 2, 0)
 
-    def optimize(self) -> None:
-        """One optimizer step, gradients cleared."""
+    def optimize(self, share: float = 1.0) -> None:
+        """One optimizer step, gradients cleared; the next one has this share of the learning rates."""
         self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
+        for group, rate in zip(self.optimizer.param_groups, (RATE, RATE / 5)):
+            group["lr"] = share * rate
 
     def _seen(self, view: View, image: Tensor) -> tuple[Tensor, Tensor]:
         """Harmonics [nodes, (DEGREE + 1)^2] and colours [nodes, 3] at those nodes of a view inside of its image."""

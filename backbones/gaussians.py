@@ -35,11 +35,10 @@ class Gaussians:
         """Device of the parameters."""
         return next(iter(self.parameters.values())).device
 
-    def set_learning_rate(self, name: str, value: float) -> None:
-        """Learning rate of one named tensor from the next step on."""
+    def set_learning_rates(self, rates: Mapping[str, float]) -> None:
+        """Learning rates of the named tensors from the next step on; names that there are not do no harm."""
         for group in self.optimizer.param_groups:
-            if group["name"] == name:
-                group["lr"] = value
+            group["lr"] = rates[group["name"]]
 
     def append(self, rows: Mapping[str, Tensor]) -> None:
         """Add K rows (each tensor [K, ...]) at the end; their moments and statistics are zero."""

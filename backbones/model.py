@@ -38,6 +38,10 @@ TIME_RATE = 1.6e-3
 """Learning rate of mean times, relative to the duration."""
 COLOR_RATE = 1e-2
 """Learning rate of the constant colour; higher harmonics learn at a twentieth of it."""
+SETTLING = 0.3
+"""Share of a run, at its end, in which all learning rates fall: Gaussians that follow each image in turn come to rest."""
+LAST_RATE = 0.05
+"""What is left of the learning rates at the last step."""
 
 
 @dataclass(frozen=True)
@@ -228,15 +232,18 @@ class SplatModel(ABC):
         statistics["seen"].index_add_(0, self._drawn, (length > 0).to(length))
 
     def optimize(self, step: int, iterations: int) -> None:
-        """One optimizer step, gradients cleared, learning rate of positions for the next step set."""
+        """One optimizer step, gradients cleared, learning rates for the next step set."""
         self.gaussians.optimizer.step()
         self.gaussians.optimizer.zero_grad(set_to_none=True)
+        share = settled(step, iterations)
         if self.background is not None:
-            self.background.optimize()
+            self.background.optimize(share)
         if self.appearance is not None:
-            self.appearance.optimize()
-        first = self.settings.position_rate * self.extent
-        self.gaussians.set_learning_rate("positions", decayed_rate(first, LAST_POSITION_RATE * first, step, iterations))
+            self.appearance.optimize(share)
+        rates = learning_rates(self.settings, self.extent, self.duration)
+        first = rates["positions"]
+        rates["positions"] = decayed_rate(first, LAST_POSITION_RATE * first, step, iterations)
+        self.gaussians.set_learning_rates({name: share * rate for name, rate in rates.items()})
         for observer in self.observers:
             observer.optimized()
 
@@ -296,6 +303,12 @@ def learning_rates(settings: SplatSettings, extent: float, duration: float) -> d
         "log_time_scales": settings.scale_rate,
         **dict.fromkeys(("left", "right", "rotations"), ROTATION_RATE),
     }
+
+
+def settled(step: int, iterations: int) -> float:
+    """Share of the learning rates after `step` of `iterations`: 1, and linear to `LAST_RATE` over the last steps."""
+    left = min(max(1 - step / max(iterations, 1), 0.0) / SETTLING, 1.0)
+    return LAST_RATE + (1 - LAST_RATE) * left
 
 
 def decayed_rate(first: float, last: float, step: int, iterations: int) -> float:

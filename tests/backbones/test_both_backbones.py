@@ -149,6 +149,20 @@ def test_a_resumed_run_is_bitwise_the_uninterrupted_one(
     assert whole.model.appearance.change("cam0").abs().max() > 0
 
 
+def test_a_run_comes_to_rest_at_its_end(backbone: str) -> None:
+    """All learning rates are a twentieth in the end, positions' also a hundredth; none rises past the last step."""
+    model = make_model(COUNT, backbone=backbone)
+
+    def rates(step: int) -> dict[str, float]:
+        model.optimize(step, 100)
+        return {group["name"]: group["lr"] for group in model.gaussians.optimizer.param_groups}
+
+    first, late, end = rates(0), rates(70), rates(100)
+    assert late == {**first, "positions": pytest.approx(first["positions"] * 0.01**0.7)}
+    assert end == pytest.approx({**{n: rate / 20 for n, rate in first.items()}, "positions": first["positions"] / 2000})
+    assert rates(130) == end
+
+
 def test_training_lowers_the_loss_of_the_tiny_scene(backbone: str) -> None:
     losses: list[float] = []
     trainer = make_trainer(iterations=100, backbone=backbone)
