@@ -25,7 +25,7 @@ from d2_plugin.rasterizer import Splats, View
 from d2_plugin.settings import Seed
 
 from .deform_fields import Box, HexPlaneField, HexPlaneSettings, Offsets
-from .model import SplatModel, SplatSettings, decayed_rate, settled
+from .model import SplatModel, SplatSettings, decayed, settled
 from .starting import identity_quaternions, isotropic_rows, lasting_rows
 from .trainer import Trainer, TrainSettings
 
@@ -143,8 +143,7 @@ class Deform(SplatModel):
         self.field_optimizer.step()
         self.field_optimizer.zero_grad(set_to_none=True)
         for group, start in zip(self.field_optimizer.param_groups, self.field.parameter_groups()):
-            group["lr"] = decayed_rate(start["lr"], start["lr"] * FIELD_DECAY, step, iterations)
-            group["lr"] *= settled(step, iterations)
+            group["lr"] = start["lr"] * decayed(FIELD_DECAY, step, iterations) * settled(step, iterations)
         strength = max(1 - 2 * step / max(iterations, 1), 0.0) * TIME_NOISE * self.duration
         self._noise = strength * torch.randn((), generator=self._generator).item()
 

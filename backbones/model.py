@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -39,7 +38,9 @@ TIME_RATE = 1.6e-3
 COLOR_RATE = 1e-2
 """Learning rate of the constant colour; higher harmonics learn at a twentieth of it."""
 SETTLING = 0.3
-"""Share of a run, at its end, in which all learning rates fall: Gaussians that follow each image in turn come to rest."""
+"""Share of a run, at its end, in which all learning rates fall: Gaussians that follow each image come to rest."""
+LONG = 2000
+"""Steps below which that share is smaller, in proportion: a short run has still to learn."""
 LAST_RATE = 0.05
 """What is left of the learning rates at the last step."""
 
@@ -241,8 +242,7 @@ class SplatModel(ABC):
         if self.appearance is not None:
             self.appearance.optimize(share)
         rates = learning_rates(self.settings, self.extent, self.duration)
-        first = rates["positions"]
-        rates["positions"] = decayed_rate(first, LAST_POSITION_RATE * first, step, iterations)
+        rates["positions"] *= decayed(LAST_POSITION_RATE, step, iterations)
         self.gaussians.set_learning_rates({name: share * rate for name, rate in rates.items()})
         for observer in self.observers:
             observer.optimized()
@@ -307,13 +307,10 @@ def learning_rates(settings: SplatSettings, extent: float, duration: float) -> d
 
 def settled(step: int, iterations: int) -> float:
     """Share of the learning rates after `step` of `iterations`: 1, and linear to `LAST_RATE` over the last steps."""
-    left = min(max(1 - step / max(iterations, 1), 0.0) / SETTLING, 1.0)
-    return LAST_RATE + (1 - LAST_RATE) * left
+    last = SETTLING * iterations * min(iterations / LONG, 1.0)
+    return LAST_RATE + (1 - LAST_RATE) * min(max(iterations - step, 0) / max(last, 1.0), 1.0)
 
 
-def decayed_rate(first: float, last: float, step: int, iterations: int) -> float:
-    """Learning rate after `step` of `iterations`: exponential from `first` to `last`; 0 where one of them is."""
-    if first * last == 0:
-        return 0.0
-    fraction = min(step / max(iterations, 1), 1.0)
-    return math.exp((1 - fraction) * math.log(first) + fraction * math.log(last))
+def decayed(last: float, step: int, iterations: int) -> float:
+    """Share of a learning rate after `step` of `iterations`: exponential from 1 to `last`."""
+    return last ** min(step / max(iterations, 1), 1.0)

@@ -48,8 +48,6 @@ MOST_MOVING = 0.5
 class DensifyConfig(HookConfig):
     """Depth-guided insertion of Gaussians."""
 
-    start: Steps = 1
-    """First step at which it may run."""
     stop: Steps | None = 1500
     """First step at which it no longer runs; refinement continues after it."""
     every: Every = 100

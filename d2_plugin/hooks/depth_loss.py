@@ -21,19 +21,13 @@ from d2_plugin.hooks.prior import FAR, NEAR, KnownMaps
 from d2_plugin.hooks.rendered_depth import EPSILON, rendered_depth
 from d2_plugin.protocol import View, call_optional
 from d2_plugin.rasterizer import rasterize
-from d2_plugin.settings import Every, Range, Share, Steps
+from d2_plugin.settings import Range, Share
 
 
 @dataclass(frozen=True)
 class DepthLossConfig(HookConfig):
     """Verified-depth supervision."""
 
-    start: Steps = 1
-    """First step at which it is added."""
-    stop: Steps | None = None
-    """First step at which it is no longer added; none: to the end."""
-    every: Every = 1
-    """Steps between additions."""
     weight: Annotated[float, Range(0, 1e6)] = 0.2
     """lambda_d of each addition; what matters is weight / every."""
     opaque: Annotated[float, Range(0, 1e6)] = 0.05

@@ -20,7 +20,7 @@ from d2_plugin.hooks.hook import Context, Hook, HookConfig
 from d2_plugin.hooks.prior import Kept
 from d2_plugin.protocol import Backbone, Label, View, call_optional
 from d2_plugin.rasterizer import rasterize
-from d2_plugin.settings import Every, Range, Share, Steps
+from d2_plugin.settings import Range, Share
 
 log = logging.getLogger(__name__)
 
@@ -30,14 +30,8 @@ ORDER = (2, 1, 2, 3)
 
 @dataclass(frozen=True)
 class MotionConfig(HookConfig):
-    """Supervision between instants."""
+    """Supervision between instants. Each time costs a render, with gradients, of the part that moves."""
 
-    start: Steps = 1
-    """First step at which it is added."""
-    stop: Steps | None = None
-    """First step at which it is no longer added; none: to the end."""
-    every: Every = 1
-    """Steps between additions. Each costs a render, with gradients, of the part that moves."""
     weight: Annotated[float, Range(0, 1e6)] = 1.0
     """Weight beside the trainer's own photometric loss."""
     ssim_weight: Share = 0.2

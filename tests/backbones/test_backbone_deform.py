@@ -20,7 +20,6 @@ from d2_plugin.backbones.deform_fields import (
     bend,
 )
 from d2_plugin.backbones.densify import grow
-from d2_plugin.backbones.model import decayed_rate
 from d2_plugin.gaussians.slicing import MARGINAL_CUT, slice_gaussians
 from d2_plugin.protocol import Points
 from d2_plugin.recordings.export.folder import save_recording
@@ -129,10 +128,6 @@ def test_d2_train_runs_and_scores_it(tmp_path: Path) -> None:
     metrics = Run.load(tmp_path / "run").evaluate(images=False)
     assert metrics["backbone"] == "deform"
     assert metrics["test"]["psnr"] > 8
-
-
-def test_a_field_that_does_not_learn_has_the_rate_nothing() -> None:
-    assert decayed_rate(0.0, 0.0, 5, 10) == 0.0
 
 
 def make_field(seed: int = 0) -> HexPlaneField:

@@ -123,10 +123,10 @@ class TestColour:
         model = make_model(1, background=True)
         model.select(torch.arange(0))
         sky, frames = model.background, Sky()
-        for step in range(150):
+        for step in range(100):
             index = step % 3
             (model.render(frames.views[index]).color - frames.image(index)).abs().mean().backward()
-            model.optimize(step, 150)
+            model.optimize(step, 100)
         assert (sky_of(sky, turned(frames.views[0], 0.1)) - bright).abs().mean() < 0.02
 
 
