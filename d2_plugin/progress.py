@@ -20,16 +20,18 @@ class _Lines:
 
     def __init__(self, title: str, total: int) -> None:
         self.title, self.total = title, max(total, 1)
-        self.start = self.last = time.monotonic()
+        self.last = time.monotonic()
+        self._first: tuple[float, int] | None = None
 
     def update(self, done: int, note: str = "") -> None:
         """`done` units of work are finished; `note` is shown behind."""
         now = time.monotonic()
+        since, before = self._first = self._first or (now, done)  # what starts workers is not repeated for each unit
         if now - self.last < 10 and done < self.total:
             return
         self.last = now
-        left = (now - self.start) / max(done, 1) * (self.total - done)
-        sys.stderr.write(f"{self.title}: {done}/{self.total}, {left:.0f} s left {note}\n")
+        left = f", {(now - since) / (done - before) * (self.total - done):.0f} s left" if done > before else ""
+        sys.stderr.write(f"{self.title}: {done}/{self.total}{left} {note}\n")
 
 
 class _Rich:

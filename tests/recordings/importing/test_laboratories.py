@@ -52,6 +52,7 @@ def lenses(folder: Path, cameras: dict[str, Camera]) -> Path:
     return folder / "lenses.json"
 
 
+@pytest.mark.slow
 def test_webcams_with_a_board_are_placed_in_metres(webcams: tuple, tmp_path: Path, capsys) -> None:
     folder, truth = webcams
     words = ["import", str(folder), "--intrinsics", str(lenses(tmp_path, truth)), "--board", "charuco:7x5:0.2:0.15"]
@@ -80,6 +81,7 @@ def test_webcams_whose_board_is_hidden_from_one_are_told_so(webcams: tuple, tmp_
     assert "--board is matched at moments" in refused(*words, "--output", tmp_path / "c")
 
 
+@pytest.mark.slow
 def test_xvid_at_wide_angles_is_imported_and_a_turned_camera_named(
     shared_data: Callable[[str], Path], tmp_path: Path, capsys
 ) -> None:
