@@ -51,8 +51,7 @@ class D2Config(_HookTables):
     and frames have other names there. Found without this where the trainer's cameras know the paths of their images.
     """
     iterations: AtLeastOne | None = None
-    """Length of the trainer's run: what the hooks' tables leave out of start, stop, every and budget follows from it.
-    """
+    """Steps of the trainer's run: what the hooks' tables leave out of start, stop, every and budget follows from it."""
     views_per_evaluation: Annotated[int, Range(1, 10_000)] = 8
     """Training views surveyed at each structure update, taken in turn over all cameras and frames; at the first one at
     least one of each camera seen so far."""

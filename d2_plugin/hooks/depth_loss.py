@@ -38,8 +38,7 @@ class DepthLossConfig(HookConfig):
     tau_v: Share = 0.5
     """Pixels whose accumulated alpha does not exceed this are left out."""
     sigma_full: Annotated[float, Range(1e-6, 1e6)] = 0.05
-    """Relative standard deviation up to which a pixel counts in full; beyond it, in proportion to sigma_full / sigma.
-    """
+    """Relative standard deviation up to which a pixel counts in full; beyond it, as sigma_full / sigma."""
 
 
 def charbonnier(residual: Tensor, epsilon: float | Tensor) -> Tensor:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from d2_plugin.errors import D2Error
@@ -173,6 +173,7 @@ def test_at_the_boundary_the_scale_wants_to_be_negative_and_the_shift_is_best() 
 @given(
     st.integers(2, 60), st.integers(0, 10**6), st.floats(0, 1), st.sampled_from([1e-6, 1e-3, 0.1, 1.0]), st.booleans()
 )
+@example(n=2, seed=1155, outliers=1.0, epsilon=1e-6, weighted=True)  # where the step to a feasible dual lost digits
 def test_the_gap_bounds_the_distance_to_every_other_line(
     n: int, seed: int, outliers: float, epsilon: float, weighted: bool
 ) -> None:

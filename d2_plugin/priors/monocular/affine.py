@@ -265,22 +265,24 @@ class _Problem:
 
     def lower_bound(self, a: float, b: float, here: Sums) -> float:
         """The dual value of u = rho'(r) after making it feasible; valid for every feasible a and b."""
-        slope_a, slope_b = here.slope
-        keep = max(0.0, slope_a) if a <= 0 else 0.0
+        keep = max(0.0, here.slope[0]) if a <= 0 else 0.0
         r = self.residual(a, b)
         u = r * (1 / self.root(r))
         best = -np.inf
         # Moving only those u that have room to +-1 wastes least; where none has, all of them move and are scaled.
         for room, normal in ((1 - u * u, here.room), (np.ones_like(u), self.plain)):
-            step = _solve_2x2(*normal, slope_a - keep, slope_b)
-            if step is None and (keep != slope_a or slope_b != 0):
-                continue
-            along_a, along_b = step or (0.0, 0.0)
-            moved = u - room * (along_a * self.p + along_b * self.q)
-            feasible = moved / max(1.0, float(np.abs(moved).max()))
-            square = np.minimum(feasible * feasible, 1.0)
-            conjugate = float((square / (1 + np.sqrt(1 - square))).sum())
-            best = max(best, -dot(feasible, self.t) - self.epsilon * conjugate)
+            moved = u
+            for _ in range(2):  # once more for what rounding leaves where the matrix is nearly singular
+                left = dot(self.p, moved) - keep, dot(self.q, moved)
+                step = _solve_2x2(*normal, *left) or (None if any(left) else (0.0, 0.0))
+                if step is None:
+                    break
+                moved = moved - room * (step[0] * self.p + step[1] * self.q)
+            else:
+                feasible = moved / max(1.0, float(np.abs(moved).max()))
+                square = np.minimum(feasible * feasible, 1.0)
+                conjugate = float((square / (1 + np.sqrt(1 - square))).sum())
+                best = max(best, -dot(feasible, self.t) - self.epsilon * conjugate)
         return best
 
 
