@@ -36,7 +36,7 @@ class Gaussians:
         return next(iter(self.parameters.values())).device
 
     def set_learning_rates(self, rates: Mapping[str, float]) -> None:
-        """Learning rates of the named tensors from the next step on; names that there are not do no harm."""
+        """Learning rates by name of tensor from the next step on; there may be more names than tensors."""
         for group in self.optimizer.param_groups:
             group["lr"] = rates[group["name"]]
 
