@@ -6,7 +6,7 @@
 // reduction, the warps of a tile are added in their order, and every (Gaussian, tile) has a place of its own to write
 // to. No float is ever added atomically: the same inputs give the same bits in every run.
 //
-// No header besides splat.h, so that NVRTC compiles it without a toolkit; tests run it on the CPU (tests/cuda_shim.h).
+// No header besides splat.h, so that NVRTC compiles it without a toolkit; tests/rasterizer/cuda_shim.h runs it on the CPU.
 // Defined by the host (cuda.py): D2_CHANNELS, colors per Gaussian; D2_FRAME_SIZE, bytes of its Frame.
 #include "splat.h"
 

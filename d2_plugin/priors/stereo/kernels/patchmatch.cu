@@ -1,7 +1,7 @@
 // PatchMatch multi-view stereo on the GPU: one thread per pixel does what spread.h says, with the window around it in
 // shared memory. The same bits as patchmatch.cpp on a CPU with fused multiply-add.
 //
-// No header besides ours, so that NVRTC compiles it without a toolkit; tests run it on the CPU (tests/cuda_shim.h).
+// No header besides ours, so that NVRTC compiles it without a toolkit; tests/rasterizer/cuda_shim.h runs it on the CPU.
 // Defined by the host (patchmatch_cuda.py): D2_MAX_SOURCES, sources of a view; D2_CALL_SIZE, bytes of its Call.
 #include "spread.h"
 
