@@ -42,18 +42,16 @@ class WatchedModel(Resizing, Observer, Generic[Model]):
         return self.model.slice_at(view)
 
     def colors(self, view: View, splats: Splats) -> Tensor:
-        """RGB [M, 3] of the sliced Gaussians as seen in `view`."""
-        return self.model.colors(view, splats)
+        """RGB [M, 3] of the sliced Gaussians as the view's camera saw them."""
+        return self.model.colors_seen(view, splats)
 
     def trained(self) -> dict[str, Tensor]:
         """The tensors that are trained, by name."""
         return dict(trained_tensors(self.model))
 
     def behind(self, render: Render, view: View) -> Render:
-        """The render with the model's background, if it has one, and in the colours of the view's camera."""
-        if self.model.background is not None:
-            render = self.model.background.behind(render, view)
-        return render if self.model.appearance is None else self.model.appearance.seen_by(view.camera, render)
+        """The render with the model's background as the view's camera saw it."""
+        return self.model.behind(render, view)
 
     def insert(self, points: Points) -> int:
         """Insert isotropic Gaussians at the points, living around the time of their frame; returns their number."""

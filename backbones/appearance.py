@@ -12,8 +12,7 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
-
-from d2_plugin.rasterizer import Render
+from torch.nn import functional
 
 RATE = 5e-3
 """Learning rate of the changes: a gain that is 20 % off takes about fifty steps of its camera."""
@@ -43,20 +42,17 @@ class Appearance:
             elif name not in self.changes:
                 self._add(name, change)
 
-    def seen_by(self, camera: str, render: Render) -> Render:
-        """The render in the colours of `camera`; unchanged where that camera never trained.
+    def change(self, camera: str) -> Tensor | None:
+        """M_c - mean M [3, 4]; None where `camera` never trained. One that is asked for with gradients trains from then on.
 
-        A camera that renders with gradients trains from then on.
+        The gradient is that of M_c alone, since the other cameras do not see its images.
         """
-        if torch.is_grad_enabled() and camera not in self.changes and camera not in self.measured:
+        if camera in self.measured:
+            return self.measured[camera]
+        if camera not in self.changes:
+            if not torch.is_grad_enabled():
+                return None
             self._add(camera, torch.zeros(3, 4, device=self.device))
-        if camera not in self.changes and camera not in self.measured:
-            return render
-        change = self.change(camera) if camera in self.changes else self.measured[camera]
-        return render._replace(color=render.color + render.color @ change[:, :3].T + change[:, 3])
-
-    def change(self, camera: str) -> Tensor:
-        """M_c - mean M [3, 4]; the gradient is that of M_c alone, since the other cameras do not see this image."""
         mean = torch.stack([value.detach() for value in self.changes.values()]).mean(0)
         return self.changes[camera] - mean
 
@@ -89,3 +85,9 @@ class Appearance:
     def _add(self, camera: str, change: Tensor) -> None:
         self.changes[camera] = nn.Parameter(change)
         self._optimizers[camera] = torch.optim.Adam([self.changes[camera]], lr=RATE, eps=1e-15)
+
+
+def changed(colors: Tensor, change: Tensor | None) -> Tensor:
+    """Colours [..., 3] after a change [3, 4]. What Gaussians and background show is linear in their colours, so
+    theirs are changed: there are fewer of them than of pixels."""
+    return colors if change is None else colors + functional.linear(colors, change[:, :3], change[:, 3])

@@ -15,8 +15,10 @@ import torch
 from torch import Tensor, nn
 
 from d2_plugin.gaussians.native_background import can_composite, composite_background
-from d2_plugin.gaussians.spherical_harmonics import basis
+from d2_plugin.gaussians.spherical_harmonics import SH_C0, basis
 from d2_plugin.rasterizer import Render, View
+
+from .appearance import changed
 
 DEGREE = 3
 """Of the harmonics."""
@@ -64,19 +66,23 @@ class Background:
         self.constant.copy_(solved[:1])
         self.harmonics.copy_(solved[1:])
 
-    def behind(self, render: Render, view: View) -> Render:
-        """The render with the background where the Gaussians leave some of a ray."""
-        basis = self._basis(view)
-        parts = render.color, render.alpha, basis, self.constant, self.harmonics
+    def behind(self, render: Render, view: View, change: Tensor | None = None) -> Render:
+        """The render with the background, after a `change` of colour, where the Gaussians leave some of a ray."""
+        basis, constant, harmonics = self._basis(view), self.constant, self.harmonics
+        if change is not None:
+            constant = (changed(SH_C0 * constant + 0.5, change) - 0.5) / SH_C0
+            harmonics = changed(harmonics, torch.cat([change[:, :3], torch.zeros_like(change[:, 3:])], 1))
         if can_composite(render.color, render.alpha, basis):
+            parts = render.color, render.alpha, basis, constant, harmonics
             return render._replace(color=composite_background(*parts, _nodes(view)))
-        return render._replace(color=render.color + (1 - render.alpha)[..., None] * self._interpolated(view, basis))
+        image = self._interpolated(view, basis, torch.cat([constant, harmonics]))
+        return render._replace(color=render.color + (1 - render.alpha)[..., None] * image)
 
-    def _interpolated(self, view: View, basis: Tensor) -> Tensor:
+    def _interpolated(self, view: View, basis: Tensor, coefficients: Tensor) -> Tensor:
         """The background [H, W, 3] in torch: any dtype and device, and the oracle of the kernel."""
         rows, columns, stride = _nodes(view)
         # Not a matrix product: BLAS sums in an order that depends on the number of threads.
-        summands = basis[..., None] * torch.cat([self.constant, self.harmonics])
+        summands = basis[..., None] * coefficients
         coarse = (summands.sum(1) + 0.5).clamp(0, 1)
         nodes = coarse.view(rows, columns, 3).permute(2, 0, 1)
         fine = _refined(_refined(nodes, stride).transpose(1, 2), stride).transpose(1, 2)

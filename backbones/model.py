@@ -18,7 +18,7 @@ from d2_plugin.protocol import Points
 from d2_plugin.rasterizer import RasterSettings, Render, Splats, View, rasterize
 from d2_plugin.settings import LearningRate, Range, Settings
 
-from .appearance import Appearance
+from .appearance import Appearance, changed
 from .background import Background
 from .densify import DensifySettings, densify
 from .gaussians import Gaussians
@@ -168,8 +168,16 @@ class SplatModel(ABC):
         """Rotation matrices [D, D, K] of raw rows, D = 3 or, with time as the last axis, 4."""
 
     def colors(self, view: View, splats: Splats) -> Tensor:
-        """RGB [M, 3] of the sliced Gaussians as seen in `view`."""
+        """RGB [M, 3] of the sliced Gaussians as seen in `view`, by the mean camera where exposures are learnt."""
         return self.harmonic_colors(view, splats)
+
+    def colors_seen(self, view: View, splats: Splats) -> Tensor:
+        """RGB [M, 3] of the sliced Gaussians as the view's camera saw them."""
+        return changed(self.colors(view, splats), self.change(view))
+
+    def change(self, view: View) -> Tensor | None:
+        """The change of colour [3, 4] from the mean camera to that of a view; None where there is none."""
+        return None if self.appearance is None else self.appearance.change(view.camera)
 
     def harmonic_colors(self, view: View, splats: Splats, phase: Tensor | None = None, time_degree: int = 0) -> Tensor:
         """Spherical harmonics in the direction of view, with `phase` [M] (fraction of the duration) also in time."""
@@ -200,17 +208,28 @@ class SplatModel(ABC):
         A given `background` colour takes the place of the model's own background.
         """
         splats = self.slice_at(view)
-        colors = self.colors(view, splats)
+        colors = self.colors_seen(view, splats)
         self._drawn = splats.rows
         self.screen_offsets = _zeros(splats.means).requires_grad_(torch.is_grad_enabled())
+        if background is not None:
+            background = changed(background, self.change(view))
         render = rasterize(
             splats, colors, view, self.settings.raster, background=background, screen_offsets=self.screen_offsets
         )
-        if self.background is not None and background is None:
-            render = self.background.behind(render, view)
+        if background is None:
+            render = self.behind(render, view)
         for observer in self.observers:
             observer.rendered(view, render)
-        return render if self.appearance is None else self.appearance.seen_by(view.camera, render)
+        return render
+
+    def behind(self, render: Render, view: View) -> Render:
+        """The render with the background, which is black without a model of it, as the view's camera saw it."""
+        change = self.change(view)
+        if self.background is not None:
+            return self.background.behind(render, view, change)
+        if change is None:
+            return render
+        return render._replace(color=render.color + (1 - render.alpha)[..., None] * change[:, 3])
 
     def start_from(self, views: Sequence[View], images: Callable[[int], Tensor]) -> None:
         """Before the first step: colours of the background from the training images, see `Background.start_from`."""

@@ -235,13 +235,12 @@ class Backbone(Protocol):
         as how many of Adam's steps the optimizer's first `step` count, where it takes smaller ones for a while, as
         RAdam does: schedules count these. It rises by one a step at most.
     ``colors(view, splats) -> Tensor``
-        RGB [M, 3], 0 or more, of what `slice_at(view)` returned, differentiable: the live viewer shows them, and grey
-        without; the hook `motion` supervises them.
+        RGB [M, 3] of what `slice_at(view)` returned, as the view's camera saw them where exposures are learnt,
+        differentiable: the live viewer shows them, and grey without; the hook `motion` supervises them.
     ``trained() -> Mapping[str, Tensor]``
         the tensors that are trained, by name: training stops where one is not finite, and names it.
     ``behind(render, view) -> Render``
-        the render with the backbone's own background where the Gaussians leave some of a ray, in the colours of the
-        view's camera where exposures are learnt.
+        the render with the backbone's own background, in the same colours, where the Gaussians leave some of a ray.
     """
 
     settings: RasterSettings

@@ -20,7 +20,7 @@ from tiny import (
 from torch import Tensor
 
 from d2_plugin.backbones import background as module
-from d2_plugin.backbones.appearance import Appearance
+from d2_plugin.backbones.appearance import Appearance, changed
 from d2_plugin.backbones.background import Background
 from d2_plugin.plugin import D2Hooks
 from d2_plugin.protocol import Render, View
@@ -217,10 +217,6 @@ def test_gains_are_learnt_and_a_camera_that_did_not_train_sees_the_mean() -> Non
 MEASURED = {"a": (1.2, 1.1, 1.0), "b": (0.8, 0.9, 1.0), "held": (1.4, 1.0, 0.7)}
 
 
-def grey() -> Render:
-    return Render(torch.full((2, 2, 3), 0.5), torch.ones(2, 2), torch.ones(2, 2))
-
-
 def started() -> Appearance:
     appearance = Appearance(torch.device("cpu"))
     appearance.start_from(MEASURED, ("a", "b"))
@@ -230,7 +226,8 @@ def started() -> Appearance:
 def test_each_camera_sees_its_gain_before_the_first_step_and_only_training_cameras_learn() -> None:
     appearance = started()
     for camera, gain in MEASURED.items():
-        torch.testing.assert_close(appearance.seen_by(camera, grey()).color[0, 0], 0.5 * torch.tensor(gain))
+        seen = changed(torch.full((3,), 0.5), appearance.change(camera))
+        torch.testing.assert_close(seen, 0.5 * torch.tensor(gain))
     assert set(appearance.changes) == {"a", "b"}
 
 
@@ -243,9 +240,29 @@ def test_nothing_begins_where_a_training_camera_has_no_gain() -> None:
 
 def test_measured_changes_are_saved_with_those_that_learn() -> None:
     appearance, again = started(), Appearance(torch.device("cpu"))
-    appearance.seen_by("a", grey()).color.sum().backward()
+    changed(torch.full((2, 3), 0.5), appearance.change("a")).sum().backward()
     appearance.optimize()
     again.load_state_dict(appearance.state_dict())
-    for camera in MEASURED:
-        with torch.no_grad():
-            assert torch.equal(again.seen_by(camera, grey()).color, appearance.seen_by(camera, grey()).color)
+    assert all(torch.equal(again.change(camera), appearance.change(camera)) for camera in MEASURED)
+
+
+@pytest.mark.parametrize("background", [True, False])
+@pytest.mark.parametrize("given", [None, (0.2, 0.4, 0.9)])
+def test_the_image_is_that_of_the_mean_camera_after_the_change(background: bool, given: tuple[float, ...]) -> None:
+    """Gaussians and background are changed, which are fewer than pixels: their gradients are those of the image."""
+    model, mean = (make_model(background=background, appearance=on) for on in (True, False))
+    view, behind = make_views()[0], None if given is None else torch.tensor(given)
+    with torch.no_grad():
+        change = torch.tensor([[0.3, -0.1, 0.0, 0.05], [0.0, -0.2, 0.1, 0.0], [0.02, 0.0, 0.1, -0.04]])
+        model.appearance.measured[view.camera] = change.requires_grad_()
+        for one in (model, mean):
+            if background:
+                one.background.harmonics.uniform_(-0.05, 0.05, generator=torch.Generator().manual_seed(3))
+    seen = model.render(view, behind).color
+    expected = mean.render(view, behind).color
+    expected = expected + expected @ change[:, :3].T + change[:, 3]
+    torch.testing.assert_close(seen, expected, rtol=0, atol=2e-6)
+    weights = torch.rand(seen.shape, generator=torch.Generator().manual_seed(4))
+    (found,) = torch.autograd.grad((seen * weights).sum(), change)
+    (right,) = torch.autograd.grad((expected * weights).sum(), change)
+    torch.testing.assert_close(found, right, rtol=1e-4, atol=1e-3)
