@@ -43,9 +43,10 @@ class Appearance:
                 self._add(name, change)
 
     def change(self, camera: str) -> Tensor | None:
-        """M_c - mean M [3, 4]; None where `camera` never trained. One that is asked for with gradients trains from then on.
+        """M_c - mean M [3, 4]; None where `camera` never trained.
 
-        The gradient is that of M_c alone, since the other cameras do not see its images.
+        A camera that is asked for with gradients trains from then on. The gradient is that of M_c alone, as the others
+        do not see its images.
         """
         if camera in self.measured:
             return self.measured[camera]

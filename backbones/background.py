@@ -68,7 +68,9 @@ class Background:
 
     def behind(self, render: Render, view: View, change: Tensor | None = None) -> Render:
         """The render with the background, after a `change` of colour, where the Gaussians leave some of a ray."""
-        basis, constant, harmonics = self._basis(view), self.constant, self.harmonics
+        basis = self._basis(view)
+        constant: Tensor = self.constant
+        harmonics: Tensor = self.harmonics
         if change is not None:
             constant = (changed(SH_C0 * constant + 0.5, change) - 0.5) / SH_C0
             harmonics = changed(harmonics, torch.cat([change[:, :3], torch.zeros_like(change[:, 3:])], 1))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import Annotated, Any, TypeVar
 
 import numpy as np
@@ -14,8 +15,8 @@ from torch import Tensor
 from d2_plugin.errors import D2Error
 from d2_plugin.gaussians import spherical_harmonics as sh
 from d2_plugin.gaussians.moving import Harmonics, MovingGaussians
-from d2_plugin.protocol import Points
-from d2_plugin.rasterizer import RasterSettings, Render, Splats, View, rasterize
+from d2_plugin.protocol import DepthPrior, Points
+from d2_plugin.rasterizer import RasterSettings, Render, Splats, View, rasterize, survey
 from d2_plugin.settings import LearningRate, Range, Settings
 
 from .appearance import Appearance, changed
@@ -43,6 +44,8 @@ LONG = 2000
 """Steps below which that share is smaller, in proportion: a short run has still to learn."""
 LAST_RATE = 0.05
 """What is left of the learning rates at the last step."""
+HARDLY = 0.02
+"""Weight in its best pixel of all below which a Gaussian hardly shows: a fifth of them, worth .005 dB."""
 
 
 @dataclass(frozen=True)
@@ -282,6 +285,18 @@ class SplatModel(ABC):
         """Keep the rows `index`. All shrinking and reordering goes through here."""
         self.gaussians.select(index)
         self._report_resize(index)
+
+    @torch.no_grad()
+    def leave_out_hidden(self, views: Sequence[View]) -> None:
+        """Delete the Gaussians that hardly show in any of the views, nor halfway to the next instant of its camera."""
+        ordered = sorted(views, key=lambda view: (view.camera, view.time))
+        between = [replace(a, time=(a.time + b.time) / 2) for a, b in pairwise(ordered) if a.camera == b.camera]
+        largest = torch.zeros(len(self), device=self.gaussians.device)
+        for view in ordered + between:
+            splats, empty = self.slice_at(view), view.K.new_zeros(view.height, view.width)
+            weights = survey(splats, view, DepthPrior(empty, empty.byte()), self.settings.raster).max_weight
+            largest.scatter_reduce_(0, splats.rows, weights, "amax")
+        self.select(torch.nonzero(largest >= HARDLY).squeeze(1))
 
     def _report_resize(self, index: Tensor) -> None:
         for observer in self.observers:

@@ -171,6 +171,42 @@ def test_a_short_run_learns_to_its_last_steps(iterations: int) -> None:
     assert shares.count(1.0) == pytest.approx(iterations - 0.3 * iterations * min(iterations / 2000, 1), abs=1.01)
 
 
+def test_what_hardly_shows_is_left_out_at_the_end_of_a_run(backbone: str) -> None:
+    """Of four Gaussians one is hidden behind an opaque one; one lives but halfway between the trained instants."""
+    views = make_views()
+    at = Points(
+        torch.tensor([[0.0, 0, 2], [0, 0, 6], [0.2, 0.1, 1], [-0.2, -0.1, 1]]),
+        torch.rand(4, 3, generator=torch.Generator().manual_seed(2)),
+        torch.tensor([0.0, 0, 0.25, 0]),
+        torch.tensor([2.0, 0.05, 0.1, 0.1]),
+        torch.tensor([0.999, 0.9, 0.9, 0.9]),
+        torch.tensor([math.inf, math.inf, 0.05, math.inf]),
+    )
+    model = make_model(backbone=backbone)
+    model.select(torch.arange(0))
+    model.append(model.initial_rows(at, model.settings, model.duration))
+    with torch.no_grad():
+        model.gaussians["log_time_scales"][[0, 1, 3]] = 3.0
+    between = [replace(view, time=0.25) for view in views[:3]]
+    before = [model.render(view).color for view in views + between]
+    model.leave_out_hidden(views)
+    assert len(model) == 3
+    torch.testing.assert_close(model.gaussians["positions"].detach()[:, 2], torch.tensor([2.0, 1, 1]))
+    for view, image in zip(views + between, before, strict=True):
+        torch.testing.assert_close(model.render(view).color, image, atol=0.02, rtol=0)
+
+
+@pytest.mark.parametrize(("iterations", "looks"), [(23, False), (24, True)])
+def test_a_run_of_four_steps_for_each_view_ends_with_a_look_at_each(
+    backbone: str, iterations: int, looks: bool
+) -> None:
+    trainer, counts = make_trainer(iterations=iterations, backbone=backbone, densify=DensifySettings(every=1000)), []
+    with torch.no_grad():
+        trainer.model.gaussians["opacity_logits"][7] = -20.0
+    trainer.run(on_step=lambda step, loss: counts.append(len(trainer.model)))
+    assert counts == [60] * (iterations - 1) + [59 if looks else 60]
+
+
 def test_training_lowers_the_loss_of_the_tiny_scene(backbone: str) -> None:
     losses: list[float] = []
     trainer = make_trainer(iterations=100, backbone=backbone)
