@@ -9,7 +9,7 @@ from typing import Annotated, Any, NamedTuple, get_args
 
 import torch
 
-from benchmarks.align_measure import AlignMethod, AlignProblem, align_problem, measure, methods
+from benchmarks.align_measure import AlignMethod, AlignProblem, AlignScore, align_problem, measure, methods
 from benchmarks.rows import begin_rows, grouped, told
 from d2_plugin.errors import D2Error, refuse_unknown
 from d2_plugin.recordings.recording import MonoKind
@@ -78,17 +78,13 @@ def run(settings: AlignBench) -> str:
 
 
 def _row(method: AlignMethod, case: AlignCase, problems: list[AlignProblem], budget: float, command: str) -> Row:
-    found: dict[str, Any] = {"error": None, "seconds": None, "depth_error": None}
-    failed = None
+    found: dict[str, Any] = dict.fromkeys(AlignScore._fields)
     try:
-        gap, depth_error, seconds = measure(method, problems, budget)
-        found = {"error": gap, "seconds": seconds, "depth_error": depth_error}
+        found = measure(method, problems, budget)._asdict()
     except D2Error as error:
-        failed = str(error)
-    details = {"residual": method.residual, "seeds": len(problems), **case._asdict()}
-    return make_row(
-        "alignment", str(case), method.name, method.setting, failed=failed, command=command, **found, **details
-    )
+        found["failed"] = str(error)
+    found |= {"residual": method.residual, "seeds": len(problems), **case._asdict()}
+    return make_row("alignment", str(case), method.name, method.setting, command=command, **found)
 
 
 def tables(rows: Sequence[Row]) -> list[tuple[str, Table]]:

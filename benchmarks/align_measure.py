@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from d2_plugin.errors import D2Error
-from d2_plugin.priors.monocular.affine import charbonnier, fit_affine
+from d2_plugin.priors.monocular.affine import AffineFit, charbonnier, fit_affine
 from d2_plugin.priors.monocular.align import align
 from d2_plugin.priors.settings import AlignSettings
 from d2_plugin.recordings.recording import MonoKind
@@ -34,6 +34,9 @@ TRUE_LINE = (0.35, 0.05)
 
 HUBER = 0.02
 """Relative residual above which Huber's weights fall; RANSAC counts inliers up to twice that."""
+
+PROBES = 2000
+"""Anchors among which RANSAC counts inliers."""
 
 EXACT = 1e-13
 """Relative duality gap to which the reference optimum is solved."""
@@ -104,29 +107,27 @@ class AlignMethod:
 def methods() -> list[AlignMethod]:
     """Ours at several tolerances, and the others."""
     found = [
-        AlignMethod("certified", f"{residual}, gap {tolerance:g}", residual, _certified(residual, tolerance))
+        AlignMethod("certified", f"{residual}, gap {tolerance:g}", residual, partial(_line, residual, tolerance))
         for residual in ("relative", "absolute")
         for tolerance in (1e-2, 1e-6, 1e-10)
     ]
     found.append(AlignMethod("align()", "as the priors use it", "relative", _as_used))
-    found += [
-        AlignMethod("Huber IRLS", f"{count} iterations", "relative", partial(_huber, iterations=count))
-        for count in (5, 50)
-    ]
-    found += [AlignMethod("RANSAC", f"{count} pairs", "relative", partial(_ransac, pairs=count)) for count in (50, 500)]
-    found.append(AlignMethod("least squares", "closed form", "relative", _least_squares))
+    found += [AlignMethod("Huber IRLS", f"{count} iterations", "relative", partial(_huber, count)) for count in (5, 50)]
+    found += [AlignMethod("RANSAC", f"{count} pairs", "relative", partial(_ransac, count)) for count in (50, 500)]
+    found.append(AlignMethod("least squares", "closed form", "relative", partial(_huber, 0)))
     found.append(AlignMethod("median and MAD", "make_depth_scale.py", "relative", _median_and_mad))
     return found
 
 
-def _certified(residual: str, tolerance: float) -> Callable[[AlignProblem], Line]:
-    def fit(problem: AlignProblem) -> Line:
-        target = problem.target
-        weights, epsilon = weights_and_epsilon(target, residual)
-        found = fit_affine(problem.mono, target, weights, epsilon=epsilon, tolerance=tolerance)
-        return found.scale, found.shift
+def _certified(residual: str, tolerance: float, problem: AlignProblem) -> AffineFit:
+    target = problem.target
+    weights, epsilon = weights_and_epsilon(target, residual)
+    return fit_affine(problem.mono, target, weights, epsilon=epsilon, tolerance=tolerance)
 
-    return fit
+
+def _line(residual: str, tolerance: float, problem: AlignProblem) -> Line:
+    found = _certified(residual, tolerance, problem)
+    return found.scale, found.shift
 
 
 def _as_used(problem: AlignProblem) -> Line:
@@ -145,13 +146,8 @@ def _weighted(x: np.ndarray, y: np.ndarray, weights: np.ndarray) -> Line:
     return scale, float(mean_y - scale * mean_x)
 
 
-def _least_squares(problem: AlignProblem) -> Line:
-    target = problem.target
-    return _weighted(problem.mono, target, target**-2)
-
-
-def _huber(problem: AlignProblem, iterations: int) -> Line:
-    """Iteratively reweighted least squares with Huber's weights on the relative residual."""
+def _huber(iterations: int, problem: AlignProblem) -> Line:
+    """Least squares of the relative residual, then so many times again with Huber's weights."""
     x, y = problem.mono, problem.target
     line = _weighted(x, y, y**-2)
     for _ in range(iterations):
@@ -160,8 +156,8 @@ def _huber(problem: AlignProblem, iterations: int) -> Line:
     return line
 
 
-def _ransac(problem: AlignProblem, pairs: int, probes: int = 2000) -> Line:
-    """The line through two anchors with most inliers among `probes` anchors, then least squares over all inliers."""
+def _ransac(pairs: int, problem: AlignProblem) -> Line:
+    """The line through two anchors with most inliers among `PROBES` anchors, then least squares over all inliers."""
     x, y = problem.mono, problem.target
     rng = np.random.default_rng(0)
     first, second = rng.integers(0, x.size, (2, pairs))
@@ -169,7 +165,7 @@ def _ransac(problem: AlignProblem, pairs: int, probes: int = 2000) -> Line:
     first, second = first[apart], second[apart]
     scales = (y[first] - y[second]) / (x[first] - x[second])
     shifts = y[first] - scales * x[first]
-    probe = rng.integers(0, x.size, min(x.size, probes))
+    probe = rng.integers(0, x.size, min(x.size, PROBES))
     residual = np.abs(scales[:, None] * x[probe] + shifts[:, None] - y[probe]) / y[probe]
     best = (residual < 2 * HUBER).sum(axis=1).argmax()
     inliers = np.abs(scales[best] * x + shifts[best] - y) < 2 * HUBER * y
@@ -187,7 +183,7 @@ def _median_and_mad(problem: AlignProblem) -> Line:
 class AlignScore(NamedTuple):
     """Errors of one method on one case, medians over the seeds."""
 
-    gap: float  # F / F* - 1 in the method's own objective
+    error: float  # F / F* - 1 in the method's own objective
     depth_error: float  # median over the view of the relative depth error due to the line
     seconds: float  # median wall time of one fit
 
@@ -219,7 +215,5 @@ def _timed(method: AlignMethod, problem: AlignProblem, budget: float) -> tuple[L
 
 def optimum(problem: AlignProblem, residual: str) -> float:
     """F*, from the certified solver at a gap of `EXACT`, less what that gap leaves open."""
-    target = problem.target
-    weights, epsilon = weights_and_epsilon(target, residual)
-    found = fit_affine(problem.mono, target, weights, epsilon=epsilon, tolerance=EXACT)
+    found = _certified(residual, EXACT, problem)
     return problem.objective((found.scale, found.shift), residual) * (1 - found.gap)

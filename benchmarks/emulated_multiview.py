@@ -10,6 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from d2_plugin.priors.geometry import scaled_camera, viewing_rays
 from d2_plugin.recordings.cameras.rotations import rotation_of_vector
 from d2_plugin.recordings.recording import Camera
 from d2_plugin.recordings.synthetic.room import EDGE_BLUR, blurred, smooth_field
@@ -43,9 +44,8 @@ def emulated_multiview(
         known, sky = np.isfinite(depth), depth == 0
         solid = np.where(sky | ~known, SKY * np.nanmax(depth), depth).astype(np.float64)
         known = blurred(known.astype(np.float64), EDGE_BLUR * camera.width) > 0.99
-        v, u = np.mgrid[: camera.height, : camera.width] + 0.5
-        rays = np.stack([u, v, np.ones_like(u)], axis=-1) @ np.linalg.inv(camera.K).T
-        world = (rays * solid[..., None] - camera.T_camera_world[:3, 3]) @ camera.T_camera_world[:3, :3]
+        seen = viewing_rays(camera, np.float64) * solid[..., None]
+        world = (seen - camera.T_camera_world[:3, 3]) @ camera.T_camera_world[:3, :3]
         bend = SHARED_BEND * np.cos(world @ waves.T + phases).sum(-1) / 2
         bend = bend + OWN_BEND * smooth_field(own, depth.shape)
         soft = 1 / blurred(1 / solid, EDGE_BLUR * camera.width)
@@ -58,13 +58,12 @@ def emulated_multiview(
     if not posed:
         scale = float(np.exp(own.uniform(*np.log(SCALES))))
         poses = _in_own_frame(poses, scale, own)
-    fractions = [np.diag([1 / camera.width, 1 / camera.height, 1]) for camera in cameras]
-    sizes = [np.diag([map_.shape[1], map_.shape[0], 1]) for map_ in maps]
+    shrunk = [scaled_camera(camera, *map_.shape[::-1]) for camera, map_ in zip(cameras, maps)]
     return {
         "depth": (scale * np.stack(maps)).astype(np.float32),
         "conf": np.round(np.stack(sure), 2).astype(np.float32),
         "extrinsics": poses[:, :3].astype(np.float32),
-        "intrinsics": np.stack([a @ b @ c.K for a, b, c in zip(sizes, fractions, cameras)]).astype(np.float32),
+        "intrinsics": np.stack([camera.K for camera in shrunk]).astype(np.float32),
     }
 
 

@@ -19,7 +19,7 @@ import torch
 
 from benchmarks.priors_motion import motion_errors
 from benchmarks.rows import begin_rows, told
-from benchmarks.stereo_rigs import ARCS
+from benchmarks.stereo_rigs import ARCS, RENDERED
 from d2_plugin.errors import D2Error, refuse_unknown
 from d2_plugin.priors.build import build_priors
 from d2_plugin.priors.declared_error import (
@@ -39,12 +39,7 @@ from d2_plugin.store.store import PriorStore
 
 logger = logging.getLogger(__name__)
 
-RENDERED = tuple(f"synthetic{views}" for views in ARCS)
 RENDERED_FRAMES = 24
-FAR = "far"
-"""Method of the row about far pixels, which every case has."""
-MOTION = "motion"
-"""Method of the row about scene flow and what lies between instants, which rendered rigs have."""
 
 
 @dataclass(frozen=True)
@@ -90,20 +85,12 @@ def run(settings: PriorsBench) -> str:
         rows = rows_of(case, found, seconds, command)
         shown_text.append(f"{case.name}, {seconds:.2f} s per image, {found}")
         if case.recording.name in RENDERED:
-            views = int(case.recording.name.removeprefix("synthetic"))
+            views = RENDERED[case.recording.name]
             motion = motion_errors(views, settings.width, ARCS[views], prior_settings)
             shown_text[-1] += f"\n{motion}"
-            rows.append(
-                make_row(
-                    "priors",
-                    case.name,
-                    MOTION,
-                    error=1 - motion.right,
-                    seconds=seconds,
-                    command=command,
-                    **motion.row(),
-                )
-            )
+            about: dict[str, Any] = {f"motion_{name}": float(value) for name, value in motion._asdict().items()}
+            about |= {"seconds": seconds, "command": command}
+            rows.append(make_row("priors", case.name, "motion", error=1 - motion.right, **about))
         append_rows(settings.output, rows)
         logger.info("the prior of %s is measured", case.name)
     return told([], settings.output, *shown_text)
@@ -115,7 +102,7 @@ def cases(settings: PriorsBench) -> list[Case]:
     Raises:
         D2Error: a recording that is not there or has no true depth, an unknown rig, a camera that no recording has.
     """
-    rigs = settings.rigs or (() if settings.recordings else (RENDERED[-1],))
+    rigs = settings.rigs or (() if settings.recordings else tuple(RENDERED)[-1:])
     opened = [open_recording(path) for path in settings.recordings] + [_rendered(name, settings.width) for name in rigs]
     known = {camera for recording in opened for camera in recording.cameras}
     refuse_unknown("camera", settings.train_cameras, known)
@@ -125,8 +112,7 @@ def cases(settings: PriorsBench) -> list[Case]:
 def _rendered(name: str, width: int) -> Recording:
     """The room of `d2 demo`, with emulated maps, from as many cameras as the name says."""
     refuse_unknown("rig", [name], RENDERED)
-    views = int(name.removeprefix("synthetic"))
-    height = round(width * 9 / 16)
+    views, height = RENDERED[name], round(width * 9 / 16)
     room = synthetic_recording(views, 0, RENDERED_FRAMES, width, height, arc_degrees=ARCS[views])
     return replace(room, name=name)
 
@@ -187,4 +173,4 @@ def rows_of(case: Case, found: DeclaredErrors, seconds: float, command: str = ""
         for label, held in found.labels.items()
     ]
     far: dict[str, Any] = {"sky_found": found.sky_found, "false_far": found.false_far}
-    return [*rows, make_row("priors", case.name, FAR, error=found.false_far, **far, **about)]
+    return [*rows, make_row("priors", case.name, "far", error=found.false_far, **far, **about)]

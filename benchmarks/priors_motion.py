@@ -6,7 +6,7 @@ each quarter of the way are known exactly.
 
 import tempfile
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -56,10 +56,6 @@ class MotionErrors(NamedTuple):
             f"{self.known:.1%} known, {self.psnr:.2f} dB; depth at {self.with_depth:.1%}, {self.within:.1%} within "
             f"sigma, {self.within_two:.1%} within 2 sigma, median sigma {self.sigma:.4f}, error {self.error:.4f}"
         )
-
-    def row(self) -> dict[str, Any]:
-        """As columns of a row."""
-        return {f"motion_{name}": float(value) for name, value in self._asdict().items()}
 
 
 def motion_errors(views: int, width: int, arc_degrees: float, settings: PriorSettings) -> MotionErrors:

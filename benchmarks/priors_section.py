@@ -1,6 +1,7 @@
 """The part of the report about the depth prior: how large it says that its errors are, and how large they are."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 from d2_plugin.priors.declared_error import DECLARED, label_name
 from d2_plugin.runs.report.page import Section, sources_of
@@ -17,9 +18,9 @@ DIAGONAL_COLOR = 5
 def priors(rows: Sequence[Row]) -> Section:
     """Declared against true error: one diagram per recording, one line per label, on the same axes."""
     curves = [row for row in rows if row.get("curve")]
-    ends = _ends(value for row in curves for point in row["curve"] for value in point[:2])
+    axis = Axis.around("", (value for row in curves for point in row["curve"] for value in point[:2]), log=True)
     cases = dict.fromkeys(row["case"] for row in curves)
-    plots = [_diagram(case, [row for row in curves if row["case"] == case], ends) for case in cases]
+    plots = [_diagram(case, [row for row in curves if row["case"] == case], axis) for case in cases]
     emulated = any(row.get("mono_emulated") for row in rows)
     tables = [
         ("Errors within the declared sigma", _calibration_table(rows)),
@@ -41,20 +42,16 @@ def priors(rows: Sequence[Row]) -> Section:
     )
 
 
-def _ends(values: Iterable[float]) -> tuple[float, float]:
+def _diagram(case: str, rows: Sequence[Row], axis: Axis) -> Plot:
     """One range for both axes of all plots, so that the diagonal is one and recordings compare."""
-    axis = Axis.around("", values, log=True)
-    return axis.low, axis.high
-
-
-def _diagram(case: str, rows: Sequence[Row], ends: tuple[float, float]) -> Plot:
-    series = [Series(DIAGONAL, (), ((ends[0], ends[0]), (ends[1], ends[1])), DIAGONAL_COLOR, hollow=True)]
+    diagonal = tuple((end, end) for end in (axis.low, axis.high))
+    series = [Series(DIAGONAL, (), diagonal, DIAGONAL_COLOR, hollow=True)]
     for color, label in enumerate(LABELS):
         for row in rows:
             if row["method"] == label:
                 line = tuple((sigma, error) for sigma, error, _ in row["curve"])
                 series.append(Series(label, _points(row), line, color))
-    x, y = (Axis(label, *ends, log=True) for label in ("declared sigma", "true error, 68 % quantile"))
+    x, y = (replace(axis, label=label) for label in ("declared sigma", "true error, 68 % quantile"))
     return Plot(case, x, y, tuple(series))
 
 
@@ -71,7 +68,7 @@ def _calibration_table(rows: Sequence[Row]) -> Table:
     shares = ("share", "within", "within_two", "median_sigma", "median_error")
     held = [row for row in rows if row.get("within") is not None]
     cells = tuple(
-        (row["case"], row["method"], *(_percent(row, name) for name in shares), _seconds(row)) for row in held
+        (row["case"], row["method"], *(_percent(row, name) for name in shares), f"{row['seconds']:.2f}") for row in held
     )
     return Table((*header, "s per image"), cells)
 
@@ -108,7 +105,3 @@ def _percent(row: Mapping[str, float | None], name: str) -> str:
     if value is None:
         return "-"
     return f"{value:.2%}" if "median" in name or value < 0.01 else f"{value:.1%}"
-
-
-def _seconds(row: Row) -> str:
-    return "-" if row["seconds"] is None else f"{row['seconds']:.2f}"

@@ -24,10 +24,7 @@ __all__ = ["ReportSettings", "run"]
 PLOTTED_ANCHORS = 20_000
 """Number of anchors that is plotted, or the nearest one that was measured."""
 
-GPU = (
-    "Static analysis is what the compiler says of a kernel, and no measurement; what ran on a GPU is on "
-    "[a page of its own](gpu.md)."
-)
+GPU = "Each step is a command of its own; what it measured, such as the rows of the rasterizer, is in that section."
 STABILITY = (
     "Each parameter is swept to where other codebases break. ok: the error is below the sweep's limit; gap: it is "
     "above, and finite; failure: not finite, or refused where it should not be. Nothing is clamped in silence."
@@ -93,7 +90,7 @@ EVERY = BUILDERS | {
     ),
     "priors": priors,
     "raster": section("raster", "Rasterizer: time and precision", raster.CAPTION, raster.tables, raster_plot),
-    "gpu": section("gpu", "The GPU kernels", GPU, proof.tables),
+    "gpu": section("gpu", "On a GPU", GPU, proof.tables),
     "stability": section("stability", "Stability: stiff and extreme cases", STABILITY, sweep.tables),
     "scaling": section("scaling", "Scaling: growth with the number of frames", GROWTH, scaling.tables),
 }

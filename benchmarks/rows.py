@@ -1,7 +1,6 @@
 """What all benchmarks do with their rows: their file is looked at before anything is measured, and named at the end."""
 
 from collections.abc import Iterable, Sequence
-from contextlib import suppress
 from pathlib import Path
 
 from d2_plugin.runs.rows import Row, append_rows
@@ -17,8 +16,7 @@ def begin_rows(path: Path) -> None:
     absent = not path.exists()
     append_rows(path, [])
     if absent:
-        with suppress(OSError):
-            path.unlink()
+        path.unlink(missing_ok=True)
 
 
 def told(tables: Iterable[tuple[str, Table]], path: Path, *before: str) -> str:
@@ -27,9 +25,9 @@ def told(tables: Iterable[tuple[str, Table]], path: Path, *before: str) -> str:
     return "\n\n".join([*before, *shown, f"rows are in {path}; `python -m benchmarks report` draws them"])
 
 
-def grouped(rows: Sequence[Row], *names: str) -> dict[tuple[str, ...], list[Row]]:
+def grouped(rows: Sequence[Row], *names: str) -> dict[tuple, list[Row]]:
     """The rows that agree in these fields, by their values, in order of appearance."""
-    groups: dict[tuple[str, ...], list[Row]] = {}
+    groups: dict[tuple, list[Row]] = {}
     for row in rows:
-        groups.setdefault(tuple(row[name] for name in names), []).append(row)
+        groups.setdefault(tuple(row.get(name) for name in names), []).append(row)
     return groups

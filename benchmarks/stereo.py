@@ -11,15 +11,12 @@ import torch
 
 from benchmarks.rows import begin_rows, grouped, told
 from benchmarks.stereo_measure import VARIANTS, measure
-from benchmarks.stereo_rigs import ARCS, MIDDLEBURY, load_rigs
+from benchmarks.stereo_rigs import FROM_DISK, RENDERED, load_rigs
 from d2_plugin.runs.rows import Row, append_rows, command_line, make_row
 from d2_plugin.runs.tables import Table
 from d2_plugin.settings import AtATime, Range, Settings
 
 logger = logging.getLogger(__name__)
-
-RENDERED = tuple(f"synthetic{views}" for views in ARCS)
-FROM_DISK = ("studio", *MIDDLEBURY)
 
 
 @dataclass(frozen=True)
@@ -35,8 +32,6 @@ class StereoBench(Settings):
     """Leave out what is varied about the matcher."""
     width: Annotated[int, Range(32, unit="pixels")] = 320
     """Width of rendered images, which are 16:9, pixels."""
-    repeats: Annotated[int, Range(1)] = 1
-    """Matchings per row; times are medians, CPU seconds."""
     threads: AtATime = 1
     """CPU threads."""
     device: Literal["cpu", "cuda"] = "cpu"
@@ -47,7 +42,7 @@ class StereoBench(Settings):
 
 def run(settings: StereoBench) -> str:
     """Measure and add the rows, one per setting and rig; the tables, and where the rows lie."""
-    _set_threads(settings.threads)
+    torch.set_num_threads(settings.threads)
     begin_rows(settings.output)
     chosen = {
         name: replace(variant, patchmatch_device=settings.device)
@@ -55,12 +50,11 @@ def run(settings: StereoBench) -> str:
         if name == "default" or not settings.defaults_only
     }
     names = settings.rigs or (*RENDERED, *(FROM_DISK if settings.data else ()))
-    about = {name: getattr(settings, name) for name in ("device", "repeats")}
-    about["command"] = command_line("python -m benchmarks stereo", settings)
+    about = {"device": settings.device, "command": command_line("python -m benchmarks stereo", settings)}
     rows: list[Row] = []
     for group in [load_rigs(name, settings.data, settings.width) for name in names]:
         for name, variant in chosen.items():
-            rows.append(_row(measure(name, variant, group, repeats=settings.repeats), **about))
+            rows.append(_row(measure(name, variant, group), **about))
             append_rows(settings.output, rows[-1:])
             logger.info("%s on %s is measured", name, rows[-1]["rig"])
     return told(tables(rows), settings.output, CAPTION)
@@ -70,10 +64,7 @@ def _row(found: dict[str, Any], **more: Any) -> Row:
     """What `measure` found, as a row of the study: error 1 - F, seconds of CPU time per view."""
     case = f"{found['rig']} at {found['width']}x{found['height']}"
     error, seconds = (None, None) if found["failed"] else (1 - found["f1"], found["cpu"])
-    named = ("method", "setting", "failed")
-    details = {name: value for name, value in found.items() if name not in named}
-    arguments = {name: found[name] for name in named}
-    return make_row("stereo", case, **arguments, error=error, seconds=seconds, **details, **more)
+    return make_row("stereo", case, error=error, seconds=seconds, **found, **more)
 
 
 CAPTION = (
@@ -117,12 +108,3 @@ def _numbers(row: Row) -> list[str]:
     forms = {"completeness": "{:.3f}", "f1": "{:.3f}", "median": "{:.5f}", "wrong": "{:.2%}", "cpu": "{:.2f}"}
     forms["microseconds_per_pixel"] = "{:.1f}"
     return ["-" if row[name] is None else form.format(row[name]) for name, form in forms.items()]
-
-
-def _set_threads(count: int) -> None:
-    torch.set_num_threads(count)
-    try:
-        import cv2
-    except ImportError:
-        return  # whoever needs it says so
-    cv2.setNumThreads(count)

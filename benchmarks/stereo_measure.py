@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Iterable, Sequence
-from statistics import median
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,23 +25,20 @@ class Run(NamedTuple):
     wall: float  # seconds per view, matching alone
 
 
-def run(settings: StereoSettings, rig: Rig, depth_range: tuple[float, float], repeats: int) -> Run:
-    """Match and filter one rig; times are medians over `repeats`.
+def run(settings: StereoSettings, rig: Rig, depth_range: tuple[float, float]) -> Run:
+    """Match and filter one rig.
 
     Raises:
         D2Error: this rig cannot be matched.
     """
     grays = [gray(image) for image in rig.images]
-    cpu, wall = [], []
-    for _ in range(repeats):
-        start = time.process_time(), time.perf_counter()
-        raw = patchmatch(grays, rig.cameras, depth_range, settings)
-        cpu.append(time.process_time() - start[0])
-        wall.append(time.perf_counter() - start[1])
+    start_cpu, start = time.process_time(), time.perf_counter()
+    raw = patchmatch(grays, rig.cameras, depth_range, settings)
+    cpu, wall = time.process_time() - start_cpu, time.perf_counter() - start
     depths, costs = zip(*raw, strict=True)
     filtered = filter_depths(grays, rig.cameras, depths, costs, settings)
     views = len(rig.cameras)
-    return Run(filtered, median(cpu) / views, median(wall) / views)
+    return Run(filtered, cpu / views, wall / views)
 
 
 class Score(NamedTuple):
@@ -76,9 +72,7 @@ def score(depths: Iterable[np.ndarray], truths: Iterable[np.ndarray | None], cov
     return Score(found / pixels, f1, float(np.median(every)), precision, float(np.mean(every > 0.05)), pixels)
 
 
-def measure(
-    setting: str, settings: StereoSettings, rigs: Sequence[Rig], widen: float = 1.0, repeats: int = 1
-) -> dict[str, Any]:
+def measure(setting: str, settings: StereoSettings, rigs: Sequence[Rig], widen: float = 1.0) -> dict[str, Any]:
     """One row: scores and times over the rigs of one name, or `failed` with the matcher's own words.
 
     `widen` divides the near and multiplies the far end of the depth range.
@@ -91,7 +85,7 @@ def measure(
     }
     row |= {"width": rigs[0].cameras[0].width, "height": rigs[0].cameras[0].height, "failed": None}
     try:
-        runs = [run(settings, rig, (rig.depth_range[0] / widen, rig.depth_range[1] * widen), repeats) for rig in rigs]
+        runs = [run(settings, rig, (rig.depth_range[0] / widen, rig.depth_range[1] * widen)) for rig in rigs]
     except D2Error as error:
         return {**row, "failed": str(error)}
     found = score(

@@ -4,14 +4,14 @@ The rendered rooms are textured on most surfaces, with sensor noise of 1 % and e
 ranges come from the truth, a quarter wider on both sides.
 """
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
-from d2_plugin.errors import unknown_name
+from d2_plugin.errors import refuse_unknown
 from d2_plugin.priors.geometry import Projection, pixel_grid, view_pair
 from d2_plugin.recordings import open_recording
 from d2_plugin.recordings.recording import Camera, Recording
@@ -24,6 +24,9 @@ STUDIO_FRAMES = (0, 5, 10, 15, 19)
 MIDDLEBURY = ("art", "laundry", "motorcycle", "teddy")
 ARCS = {2: 10.0, 3: 50.0, 4: 30.0}
 """Degrees over which the cameras of a rendered rig are spread, per number of cameras: narrow, wide, and as in N3DV."""
+RENDERED = {f"synthetic{views}": views for views in ARCS}
+"""Numbers of cameras of the rendered rigs, by name."""
+FROM_DISK = ("studio", *MIDDLEBURY)
 
 NOISE = 0.01
 """Standard deviation of the sensor noise of rendered rigs, of values in 0..1."""
@@ -93,8 +96,6 @@ def _nearest_surface(x: np.ndarray, y: np.ndarray, z: np.ndarray, source: Camera
 
 def textured_rig(views: int, width: int = 320, height: int = 180, seed: int = 0) -> Rig:
     """A rendered room seen by 2, 3 or 4 cameras, with sensor noise and unequal gains."""
-    if views not in ARCS:
-        raise unknown_name("number of views", str(views), map(str, ARCS))
     rng = np.random.default_rng([seed, views])
     scene = furnished_room(seed, moving=False)
     walls = (
@@ -112,12 +113,11 @@ def textured_rig(views: int, width: int = 320, height: int = 180, seed: int = 0)
     return Rig(f"synthetic{views}", images, cameras, truths)
 
 
-def rig_of(recording: Recording, name: str, cameras: Iterable[str], frame: int) -> Rig:
+def rig_of(recording: Recording, name: str, cameras: Sequence[str], frame: int) -> Rig:
     """One frame of a recording that has true depth."""
-    names = list(cameras)
-    images = [recording.image(camera, frame) for camera in names]
-    truths = [recording.depth(camera, frame) for camera in names]
-    return Rig(name, images, [recording.cameras[camera] for camera in names], truths)
+    images = [recording.image(camera, frame) for camera in cameras]
+    truths = [recording.depth(camera, frame) for camera in cameras]
+    return Rig(name, images, [recording.cameras[camera] for camera in cameras], truths)
 
 
 def load_rigs(name: str, data: Path | None, width: int = 320) -> list[Rig]:
@@ -131,13 +131,12 @@ def load_rigs(name: str, data: Path | None, width: int = 320) -> list[Rig]:
     Raises:
         D2Error: the name is unknown, or its recording is not in `data`.
     """
-    if name.startswith("synthetic") and name[9:] in map(str, ARCS):
-        return [textured_rig(int(name[9:]), width, round(width * 9 / 16))]
+    refuse_unknown("rig", [name], (*RENDERED, *FROM_DISK))
+    if name in RENDERED:
+        return [textured_rig(RENDERED[name], width, round(width * 9 / 16))]
     folder = data or Path()
     if name == "studio":
         recording = open_recording(folder / "studio", cameras=STUDIO_CAMERAS, frames=STUDIO_FRAMES)
         return [rig_of(recording, name, STUDIO_CAMERAS, frame) for frame in STUDIO_FRAMES]
-    if name in MIDDLEBURY:
-        recording = open_recording(folder / "middlebury" / name)
-        return [rig_of(recording, name, ("left", "right"), 0)]
-    raise unknown_name("rig", name, [*(f"synthetic{views}" for views in ARCS), "studio", *MIDDLEBURY])
+    recording = open_recording(folder / "middlebury" / name)
+    return [rig_of(recording, name, ("left", "right"), 0)]

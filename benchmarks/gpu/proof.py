@@ -1,7 +1,7 @@
 """`python -m benchmarks gpu`: everything that a GPU has to show, one step after another, in less than 25 minutes.
 
 Each step has a time limit of its own and leaves its output and a row as soon as it ends, so that a machine lent for
-half an hour loses nothing. A step that cannot run here says why in one sentence; what needs no device runs without one.
+half an hour loses nothing. A step that cannot run here says why in one sentence.
 """
 
 import logging
@@ -19,7 +19,6 @@ from typing import Annotated, NamedTuple
 
 import torch
 
-from benchmarks.gpu.static import ARCHITECTURES, static_analysis
 from benchmarks.rows import told
 from d2_plugin.durable import make_folder
 from d2_plugin.errors import refuse_unknown
@@ -29,8 +28,8 @@ from d2_plugin.settings import Range, Settings
 
 logger = logging.getLogger(__name__)
 
-LONGEST = 25 * 60
-"""What all steps together may take, seconds."""
+CHECKOUT = Path(__file__).resolve().parents[2]
+"""The folder whose tests are run."""
 
 
 @dataclass(frozen=True)
@@ -39,8 +38,6 @@ class GpuBench(Settings):
 
     steps: tuple[str, ...] = ()
     """Names of the steps to run; all if not given."""
-    repository: Path = Path()
-    """Checkout of this project, whose tests are run."""
     recording: Path | None = None
     """Recording that is trained on the GPU and on the CPU."""
     train_cameras: str = "preset:4"
@@ -57,12 +54,6 @@ Need = Callable[[GpuBench], str | None]
 
 def _device(settings: GpuBench) -> str | None:
     return None if torch.cuda.is_available() else "torch sees no CUDA device: run it on a machine that has one"
-
-
-def _tests(settings: GpuBench) -> str | None:
-    if (settings.repository / "tests" / "rasterizer").is_dir():
-        return None
-    return f"'{settings.repository}' is no checkout of this project: give one with --repository"
 
 
 def _recording(settings: GpuBench) -> str | None:
@@ -84,8 +75,7 @@ class Step(NamedTuple):
     limit: int  # seconds
     needs: tuple[Need, ...]
     command: str
-    """Names in braces are settings of `GpuBench`, and programs; empty for the static analysis, which runs in this
-    process."""
+    """Names in braces are settings of `GpuBench`, and programs."""
 
     def words(self, settings: GpuBench) -> list[str]:
         """The command of this machine."""
@@ -99,7 +89,7 @@ class Step(NamedTuple):
 def _sanitizer(tool: str) -> Step:
     # Small scenes: a sanitizer slows a kernel down a hundred times.
     chosen = "{pytest} -m cuda tests/rasterizer/test_rasterizer_kernels.py -k 'one or 7x5 or survey'"
-    needs = (_device, _tests, _program("compute-sanitizer"))
+    needs = (_device, _program("compute-sanitizer"))
     return Step(120, needs, f"compute-sanitizer --tool {tool} --error-exitcode 9 {chosen}")
 
 
@@ -110,8 +100,7 @@ TRAIN = "{d2} train {recording} --train-cameras {train_cameras} --iterations {it
 PROFILE = "ncu --set basic -k 'regex:d2_(render|backward|survey)$' -c 6 -f -o {output}/profile"
 
 STEPS = {
-    "static": Step(100, (_program("nvcc"),), ""),
-    "tests": Step(180, (_device, _tests), f"{{pytest}} -m cuda {TESTED}"),
+    "tests": Step(180, (_device,), f"{{pytest}} -m cuda {TESTED}"),
     **{tool: _sanitizer(tool) for tool in ("memcheck", "racecheck", "initcheck")},
     "raster": Step(
         *(240, (_device,)),
@@ -136,44 +125,33 @@ def run(settings: GpuBench) -> str:
     refuse_unknown("step", settings.steps, STEPS)
     make_folder(settings.output)
     command = command_line("python -m benchmarks gpu", settings)
+    recording = settings.recording.resolve() if settings.recording else None
+    settings = replace(settings, output=settings.output.resolve(), recording=recording)  # steps run in the checkout
     rows = list[Row]()
     for name in settings.steps or STEPS:
-        rows += (done := _run_step(name, settings, command))
-        append_rows(settings.output / "gpu.jsonl", done)
-        logger.info("%s: %s", name, done[0]["failed"] or "done")
+        rows.append(_run_step(name, settings, command))
+        append_rows(settings.output / "gpu.jsonl", rows[-1:])
+        logger.info("%s: %s", name, rows[-1]["failed"] or "done")
     return told(tables(rows), settings.output / "gpu.jsonl") + "; the output of each step lies beside them"
 
 
-def _run_step(name: str, settings: GpuBench, command: str) -> list[Row]:
+def _run_step(name: str, settings: GpuBench, command: str) -> Row:
     step = STEPS[name]
     start = time.perf_counter()
     refused = next((reason for need in step.needs if (reason := need(settings))), None)
-    if refused is None and not step.command:
-        rows = _static(command)
-        refused = None if rows else "nvcc compiled no kernel: please report this"
-    else:
-        rows = []
-        refused = refused or _call(step, name, settings)
+    refused = refused or _call(step, name, settings)
     device = "cuda" if torch.cuda.is_available() else "cpu"
     took = time.perf_counter() - start
-    facts = make_row("gpu", name, "step", error=None, seconds=took, failed=refused, command=command, device=device)
-    return [facts, *rows]
-
-
-def _static(command: str) -> list[Row]:
-    nvcc = shutil.which("nvcc") or ""
-    return [row for architecture in ARCHITECTURES for row in static_analysis(nvcc, architecture, command)]
+    return make_row("gpu", name, "step", error=None, seconds=took, failed=refused, command=command, device=device)
 
 
 def _call(step: Step, name: str, settings: GpuBench) -> str | None:
     """Run a step's command with its output in a file; why it failed, or None."""
-    log = settings.output.resolve() / f"{name}.log"
-    words = step.words(_resolved(settings))
+    log = settings.output / f"{name}.log"
+    words = step.words(settings)
     with log.open("w") as output:
         # A session of its own: what the command started ends with it.
-        process = subprocess.Popen(
-            words, cwd=settings.repository, stdout=output, stderr=subprocess.STDOUT, start_new_session=True
-        )
+        process = subprocess.Popen(words, cwd=CHECKOUT, stdout=output, stderr=subprocess.STDOUT, start_new_session=True)
         try:
             code = process.wait(step.limit)
         except subprocess.TimeoutExpired:
@@ -183,24 +161,8 @@ def _call(step: Step, name: str, settings: GpuBench) -> str | None:
     return None if code == 0 else f"it ended with {code}: {log.name} says why"
 
 
-def _resolved(settings: GpuBench) -> GpuBench:
-    """The same with folders that mean the same from every folder."""
-    recording = settings.recording.resolve() if settings.recording else None
-    return replace(settings, output=settings.output.resolve(), recording=recording)
-
-
 def tables(rows: Sequence[Row]) -> list[tuple[str, Table]]:
-    """What became of each step, and what the compiler says of each kernel."""
+    """What became of each step."""
     steps = [row for row in rows if row["method"] == "step"]
     lines = tuple((row["case"], row["device"], f"{row['seconds']:.1f}", row["failed"] or "done") for row in steps)
-    facts = ("registers", "spill_bytes", "shared_bytes", "instructions")
-    cells = tuple(
-        (row["case"].rpartition(" ")[2], row["setting"], *(str(row[fact]) for fact in facts))
-        for row in rows
-        if row["method"] == "d2"
-    )
-    head = ("kernel", "for", "registers", "bytes spilled", "bytes shared", "instructions")
-    return [
-        ("Steps", Table(("step", "device", "s", "result"), lines)),
-        *([("Static analysis", Table(head, cells))] if cells else []),
-    ]
+    return [("Steps", Table(("step", "device", "s", "result"), lines))]

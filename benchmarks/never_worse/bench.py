@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
-from benchmarks.never_worse.maps import SPOILED, spoiled_recording
+from benchmarks.never_worse.maps import spoiled_recording
 from benchmarks.short_runs import ShortRuns, measure_missing
 from d2_plugin.errors import D2Error
 from d2_plugin.runs.ablation.presets import PRESETS
@@ -73,8 +73,8 @@ def _works(settings: NeverWorseBench, text: str) -> Iterator[Work]:
     """Every run of a case; points and priors are made here, one after the other."""
     shown = {name: getattr(settings, name) for name in ("backbone", "frames", "downscale")}
     base = RunSettings("", (), iterations=settings.steps, **shown)
-    network = replace(base, mono_onnx=settings.mono_onnx, mono_kind=settings.mono_kind)
     case = case_of(text, base)
+    network = replace(case.settings, mono_onnx=settings.mono_onnx, mono_kind=settings.mono_kind)
     own = _own(case, network)
     folder = settings.output.absolute() / case.slug
     shared = share(own, folder)
@@ -111,7 +111,7 @@ def _own(case: Case, network: RunSettings) -> RunSettings:
         return case.settings
     if network.mono_onnx is None:
         raise D2Error(f"{case.name} has no monocular maps: give a network by --mono-onnx FILE --mono-kind relative")
-    return replace(case.settings, mono_onnx=network.mono_onnx, mono_kind=network.mono_kind)
+    return network
 
 
 def _with_maps(maps: Maps, case: Case, own: RunSettings, network: RunSettings, folder: Path) -> RunSettings | None:
@@ -119,9 +119,7 @@ def _with_maps(maps: Maps, case: Case, own: RunSettings, network: RunSettings, f
     if maps == "own":
         return own
     if maps == "network":
-        given = replace(case.settings, mono_onnx=network.mono_onnx, mono_kind=network.mono_kind)
-        return None if network.mono_onnx is None or own.mono_onnx is not None else given
-    assert maps in SPOILED
+        return None if network.mono_onnx is None or own is network else network
     shown = Path(own.recording), own.train_cameras, own.frames
     path = spoiled_recording(*shown, maps, folder / "maps" / maps, prior_settings(own))
     return replace(case.settings, recording=str(path))

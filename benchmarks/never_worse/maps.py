@@ -1,7 +1,7 @@
 """Recordings whose monocular maps are wrong on purpose, each with the images of the one it was made from."""
 
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -9,7 +9,8 @@ import numpy as np
 
 from d2_plugin.durable import make_folder, write_text
 from d2_plugin.errors import D2Error
-from d2_plugin.priors.monocular.network import MonocularModel
+from d2_plugin.priors.frame import Frame
+from d2_plugin.priors.monocular.maps import MonoSource, mono_source
 from d2_plugin.priors.settings import PriorSettings
 from d2_plugin.reading import json_text
 from d2_plugin.recordings import Recording, open_recording
@@ -24,9 +25,6 @@ BLOB = 0.08
 """Standard deviation of the blobs, image widths."""
 SMALLER = 4
 """Maps of noise are this many times smaller than the image, as those of networks are."""
-
-Predicted = Callable[[str, int], np.ndarray]
-"""(camera, frame) -> the map that belongs to that image."""
 
 
 def spoiled_recording(
@@ -54,13 +52,15 @@ def spoiled_recording(
     for entry in path.resolve().iterdir():
         if entry.name != "mono" and not (make_folder(made) / entry.name).exists():
             (made / entry.name).symlink_to(entry)
-    predicted, declared = belonging(recording, prior)
+    source = mono_source(recording, prior, folder / "predicted")
+    if source is None:
+        raise D2Error(f"{recording.name} has no monocular maps: give a network")
     for camera in cameras:
         target = make_folder(made / "mono" / camera)
         for frame in recording.frames:
-            map_ = _map(kind, recording, cameras, camera, frame, predicted)
+            map_ = _map(kind, recording, cameras, camera, frame, source)
             np.save(target / f"{frame:05d}.npy", map_.astype(np.float16))
-    about = {"kind": declared, "emulated": recording.mono_emulated}
+    about = {"kind": source.kind, "emulated": recording.mono_emulated}
     write_text(made / "mono" / "mono.json", json_text(about, "mono.json"))  # last: what lacks it is made again
     if open_recording(made).mono_kind is None:
         raise D2Error(
@@ -69,21 +69,15 @@ def spoiled_recording(
     return made
 
 
-def belonging(recording: Recording, prior: PriorSettings) -> tuple[Predicted, str]:
-    """The maps that belong to the images, and what they are: the recording's own, else those of the network."""
-    if recording.mono_kind is not None:
-        return (lambda camera, frame: _present(recording.mono(camera, frame), camera, frame)), recording.mono_kind
-    if prior.mono_onnx is None or prior.mono_kind is None:
-        raise D2Error(f"{recording.name} has no monocular maps: give a network")
-    network = MonocularModel(prior.mono_onnx, prior.mono_kind, prior.mono_preprocessing, prior.mono_threads)
-    return (lambda camera, frame: network.predict(recording.image(camera, frame))), prior.mono_kind
-
-
 def _map(
-    kind: Spoiled, recording: Recording, cameras: Sequence[str], camera: str, frame: int, predicted: Predicted
+    kind: Spoiled, recording: Recording, cameras: Sequence[str], camera: str, frame: int, source: MonoSource
 ) -> np.ndarray:
     if kind == "other":
-        return predicted(*_elsewhere(recording.frames, cameras, camera, frame))
+        camera, frame = _elsewhere(recording.frames, cameras, camera, frame)
+        found = source.map(camera, Frame.read(recording, [camera], frame))
+        if found is None:
+            raise D2Error(f"camera {camera} has no monocular map of frame {frame}: add it")
+        return found
     size = recording.cameras[camera].height // SMALLER, recording.cameras[camera].width // SMALLER
     if kind == "constant":
         return np.full(size, 0.5)
@@ -99,9 +93,3 @@ def _elsewhere(frames: Sequence[int], cameras: Sequence[str], camera: str, frame
     if len(frames) > 1:
         return camera, frames[(frames.index(frame) + len(frames) // 2) % len(frames)]
     return cameras[(cameras.index(camera) + 1) % len(cameras)], frame
-
-
-def _present(map_: np.ndarray | None, camera: str, frame: int) -> np.ndarray:
-    if map_ is None:
-        raise D2Error(f"camera {camera} has no monocular map of frame {frame}: add it")
-    return map_

@@ -22,7 +22,7 @@ from d2_plugin.errors import D2Error
 from d2_plugin.priors.geometry import viewing_rays
 from d2_plugin.recordings import Recording
 from d2_plugin.runs.start import TimedPoints
-from d2_plugin.settings import AtLeastOne, Positive, Seed, Settings
+from d2_plugin.settings import AtLeastOne, Positive, Settings
 
 
 @dataclass(frozen=True)
@@ -33,8 +33,6 @@ class DenseStartConfig(Settings):
     """Points per pixel of one image, over all views and instants together, as published."""
     instants: AtLeastOne = 5
     """Instants that points come from, spread over the recording."""
-    seed: Seed = 0
-    """Of the choice of points."""
 
 
 def dense_points(inputs: Inputs, config: DenseStartConfig) -> TimedPoints:
@@ -76,7 +74,7 @@ def _started(
     recording = inputs.scene.recording
     sizes = [recording.cameras[name].width * recording.cameras[name].height for name in inputs.scene.train_cameras]
     share = round(config.density * float(np.mean(sizes)) / max(len(depths), 1))
-    rng = np.random.default_rng(config.seed)
+    rng = np.random.default_rng(0)
     parts = [
         back_projected(recording, camera, frame, depth, share, rng)
         for (camera, frame), depth in depths.items()

@@ -75,6 +75,14 @@ def expected_depth(depth_sum: Tensor, alpha: Tensor, least: float = 0.5) -> tupl
     return torch.where(valid, depth_sum / torch.where(valid, alpha, 1), 0), valid
 
 
+def in_unit_range(values: Tensor, mask: Tensor) -> Tensor:
+    """The map brought to 0..1 over the pixels that count; a constant one to 0."""
+    if not mask.any():
+        return values
+    low, high = values[mask].min(), values[mask].max()
+    return (values - low) / torch.where(high > low, high - low, 1)
+
+
 def rendered_again(context: Context, view: View, splats: Splats) -> Tensor:
     """Differentiable sum of w z [H, W] of other splats than the trainer's."""
     colors = splats.means.new_zeros(len(splats.means), 1)

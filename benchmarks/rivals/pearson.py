@@ -16,7 +16,7 @@ from typing import Annotated, Self
 import torch
 from torch import Tensor
 
-from benchmarks.rivals.inputs import RivalLoss
+from benchmarks.rivals.inputs import RivalLoss, in_unit_range
 from d2_plugin.hooks import Context, HookConfig
 from d2_plugin.hooks.depth_loss import depth_and_alpha
 from d2_plugin.protocol import View
@@ -69,12 +69,9 @@ def pearson_depth_loss(depth: Tensor, inverse_depth: Tensor, span: float = 2000.
         span: what the map's largest value is brought to, its smallest to 0.
     """
     known = inverse_depth.isfinite()
-    d, m = depth[known], inverse_depth[known]
+    d, m = depth[known], span * in_unit_range(inverse_depth, known)[known]
     if len(m) < 2:
         return 1 + 0.0 * d.sum()
-    m = m - m.min()
-    largest = m.max()
-    m = m * (span / torch.where(largest > 0, largest, 1))
     return 1 - torch.maximum(pearson_correlation(-m, d), pearson_correlation(1 / (m + offset), d))
 
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from benchmarks.rivals.inputs import RivalLoss, expected_depth
+from benchmarks.rivals.inputs import RivalLoss, expected_depth, in_unit_range
 from benchmarks.rivals.pearson import FLAT
 from d2_plugin.hooks import Context, HookConfig
 from d2_plugin.hooks.depth_loss import depth_and_alpha
@@ -71,14 +71,6 @@ def gradient_term(residual: Tensor, mask: Tensor) -> Tensor:
     columns = (residual[:, 1:] - residual[:, :-1]).abs() * (mask[:, 1:] & mask[:, :-1])
     rows = (residual[1:] - residual[:-1]).abs() * (mask[1:] & mask[:-1])
     return (columns.sum() + rows.sum()) / mask.sum().clamp(min=1)
-
-
-def in_unit_range(values: Tensor, mask: Tensor) -> Tensor:
-    """The map brought to 0..1 over the pixels that count; a constant one to 0."""
-    if not mask.any():
-        return values
-    low, high = values[mask].min(), values[mask].max()
-    return (values - low) / torch.where(high > low, high - low, 1)
 
 
 class ScaleShift(RivalLoss):

@@ -89,15 +89,12 @@ class SparsePointDepth(RivalLoss):
         """The points that a view sees."""
         key = (view.camera, view.frame)
         if key not in self._seen:
-            self._seen[key] = self._find(view)
+            camera = self.inputs.scene.recording.cameras[view.camera]
+            pixels, depths, inside = projected(camera, self._of_this_instant(view))
+            pixels, depths = pixels[inside], depths[inside]
+            shown = ~self._hidden(view, pixels, depths)
+            self._seen[key] = Seen(*(torch.from_numpy(part[shown]).to(view.K) for part in (pixels, depths)))
         return self._seen[key]
-
-    def _find(self, view: View) -> Seen:
-        camera = self.inputs.scene.recording.cameras[view.camera]
-        pixels, depths, inside = projected(camera, self._of_this_instant(view))
-        pixels, depths = pixels[inside], depths[inside]
-        shown = ~self._hidden(view, pixels, depths)
-        return Seen(*(torch.from_numpy(part[shown]).to(view.K) for part in (pixels, depths)))
 
     def _of_this_instant(self, view: View) -> np.ndarray:
         """Positions [M, 3] of the instant nearest in time."""

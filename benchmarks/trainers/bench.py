@@ -13,12 +13,12 @@ from typing import Annotated
 
 from benchmarks.trainers.page import read_rows, replaced, table
 from benchmarks.trainers.prepare import Source, prepare
-from benchmarks.trainers.trial_run import METHODS, Row, trial_row
+from benchmarks.trainers.trial_run import METHODS, trial_row
 from benchmarks.trainers.trials import TRIALS
 from d2_plugin.durable import append
 from d2_plugin.errors import D2Error, refuse_unknown
 from d2_plugin.reading import json_text, read_text
-from d2_plugin.runs.rows import circumstances, command_line
+from d2_plugin.runs.rows import Row, circumstances, command_line
 from d2_plugin.settings import Positional, Range, Seed, Settings
 
 log = logging.getLogger(__name__)

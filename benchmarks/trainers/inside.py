@@ -14,6 +14,7 @@ import random
 import runpy
 import sys
 import time
+from argparse import Namespace
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,9 @@ from torch import Tensor
 from benchmarks.trainers import between
 from benchmarks.trainers.moving import Moving
 from d2_plugin.reading import json_text
+
+PIPELINE = Namespace(convert_SHs_python=False, compute_cov3D_python=False, debug=False)
+"""What the renderers of 3D Gaussian Splatting ask for, at its defaults."""
 
 
 def main(words: list[str]) -> int:
@@ -120,8 +124,6 @@ def count(model: Any) -> int:
 @torch.no_grad()
 def score_hust4d(objects: Any, held_out: Path) -> float:
     """PSNR in dB of 4DGaussians over a folder of its layout `multipleview`, by its own reader, renderer and metric."""
-    from argparse import Namespace
-
     from gaussian_renderer import render
     from scene.dataset import FourDGSdataset
     from scene.dataset_readers import sceneLoadTypeCallbacks
@@ -131,10 +133,10 @@ def score_hust4d(objects: Any, held_out: Path) -> float:
     images = sceneLoadTypeCallbacks[kind](str(held_out)).train_cameras
     arguments, _ = objects.given["scene"]
     cameras = FourDGSdataset(images, arguments[0], kind)
-    pipe, black = Namespace(convert_SHs_python=False, compute_cov3D_python=False, debug=False), torch.zeros(3)
+    black = torch.zeros(3)
 
     def draw(camera: Any) -> Tensor:
-        return render(camera, objects.model, pipe, black, stage="fine", cam_type=kind)["render"]
+        return render(camera, objects.model, PIPELINE, black, stage="fine", cam_type=kind)["render"]
 
     return mean_psnr((cameras[index] for index in range(len(cameras))), draw, psnr)
 
@@ -145,17 +147,14 @@ def score_spacetime(objects: Any) -> float:
 
     Its test.py also asks for LPIPS, whose networks are downloaded, so it does not run everywhere.
     """
-    from argparse import Namespace
-
     from helper_train import getrenderpip, trbfunction
     from thirdparty.gaussian_splatting.utils.image_utils import psnr
 
     render, settings, rasterizer = getrenderpip("train_ours_lite")
-    pipe = Namespace(convert_SHs_python=False, compute_cov3D_python=False, debug=False)
 
     def draw(camera: Any) -> Tensor:
         named = {"basicfunction": trbfunction, "GRsetting": settings, "GRzer": rasterizer}
-        return render(camera, objects.model, pipe, torch.zeros(9), **named)["render"]
+        return render(camera, objects.model, PIPELINE, torch.zeros(9), **named)["render"]
 
     return mean_psnr(objects.scene.getTestCameras(), draw, psnr)
 

@@ -4,9 +4,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from statistics import mean, stdev
 
-from benchmarks.trainers.trial_run import ATTACHED, BARE, NO_HOOKS, Row
+from benchmarks.rows import grouped
+from benchmarks.trainers.trial_run import ATTACHED, BARE, NO_HOOKS
 from d2_plugin.errors import D2Error
 from d2_plugin.reading import parse_json, read_text
+from d2_plugin.runs.rows import Row
 from d2_plugin.runs.tables import Table, markdown
 
 START, END = "<!-- rows -->", "<!-- end -->"
@@ -33,8 +35,7 @@ def read_rows(path: Path) -> list[Row]:
         return []
     lines = read_text(path, "run `python -m benchmarks trainers`").splitlines()
     rows = [parse_json(line, f"{path}, line {i}", "run it again") for i, line in enumerate(lines, start=1) if line]
-    latest = {tuple(row.get(name) for name in _SAME): row for row in rows}
-    return list(latest.values())
+    return [same[-1] for same in grouped(rows, *_SAME).values()]
 
 
 _CASE = ("repository", "recording", "frames", "downscale", "iterations", "own_schedules", "hold_out_instants")
@@ -43,10 +44,8 @@ _SAME = (*_CASE, "seed", "method")
 
 def table(rows: Sequence[Row]) -> str:
     """Markdown: one line for each repository and recording, means over the seeds, and what did not run below."""
-    cases: dict[tuple, list[Row]] = {}
-    for row in rows:
-        cases.setdefault(tuple(row.get(name) for name in _CASE), []).append(row)
-    lines = tuple(_line(case, found) for case, found in cases.items() if any(row["psnr"] for row in found))
+    cases = grouped(rows, *_CASE).items()
+    lines = tuple(_line(case, found) for case, found in cases if any(row["psnr"] for row in found))
     failed = [
         f"- {row['repository']} on {row['recording']}, {row['method']}: {row['failed']}"
         for row in rows

@@ -5,13 +5,13 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
+
+import torch
 
 from benchmarks.trainers.prepare import Prepared
 from benchmarks.trainers.trials import Job, Trial
 from d2_plugin.reading import parse_json, read_text
-
-Row = dict[str, Any]
+from d2_plugin.runs.rows import Row
 
 BARE, NO_HOOKS, ATTACHED, WITH_MOTION = METHODS = ("bare", "no hooks", "attached", "with motion")
 
@@ -61,7 +61,7 @@ def trial_row(
 def _words(name: str, trial: Trial, job: Job, prepared: Prepared, method: str, seed: int) -> list[str]:
     words = ["-m", "benchmarks.trainers.inside", str(job.output / "outcome.json"), str(seed), str(prepared.truth)]
     words += [str(prepared.held_out)] if prepared.held_out is not None else []
-    words += ["--", name, *(() if _has_gpu() else ("--cpu",))]
+    words += ["--", name, *(() if torch.cuda.is_available() else ("--cpu",))]
     if method in CONFIGURATIONS:
         words += ["--d2", job.write("d2.toml", CONFIGURATIONS[method].format(prior=prepared.prior))]
     return [*words, "--", trial.script, *trial.words(job)]
@@ -93,16 +93,6 @@ def _places() -> list[str]:
 
 def commit_of(checkout: Path) -> str | None:
     """The commit of a checkout, with + where files differ from it; None where git knows nothing of the folder."""
-    found = [
-        subprocess.run(["git", "-C", str(checkout), *words], capture_output=True, text=True, check=False)
-        for words in (("rev-parse", "--short", "HEAD"), ("status", "--porcelain", "--untracked-files=no", "--", "*.py"))
-    ]
-    if any(result.returncode for result in found):
-        return None
-    return found[0].stdout.strip() + ("+" if found[1].stdout.strip() else "")
-
-
-def _has_gpu() -> bool:
-    import torch
-
-    return torch.cuda.is_available()
+    words = ["git", "-C", str(checkout), "describe", "--always", "--dirty=+", "--exclude=*"]
+    found = subprocess.run(words, capture_output=True, text=True, check=False)
+    return found.stdout.strip() or None

@@ -57,7 +57,7 @@ def test_a_part_adds_rows_of_what_it_measured_and_prints_their_tables(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("benchmarks.stereo._set_threads", lambda count: None)
+    monkeypatch.setattr("torch.set_num_threads", lambda count: None)
     monkeypatch.setattr(scaling, "in_fresh_process", lambda work, *given: memory.Measured(work(*given), 1.0))
     assert main([*words.split(), "--output", str(tmp_path / "rows.jsonl")]) == 0
     assert shown in capsys.readouterr().out
