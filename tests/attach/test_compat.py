@@ -155,7 +155,7 @@ class TestNearest:
             points[::7] *= 1e5
         elif kind == "repeated":
             points[count // 2 :] = points[: count - count // 2]
-        pairs, nearest.PAIRS = nearest.PAIRS, 64  # so that small clouds go through the grid, too
+        pairs, nearest.PAIRS = nearest.PAIRS, 64  # in several parts
         try:
             result = nearest.distCUDA2(torch.from_numpy(points))
         finally:
