@@ -9,6 +9,8 @@ All of it is made from finished priors, which keep their images, and lies beside
 
 from __future__ import annotations
 
+import functools
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -46,6 +48,8 @@ MOST_CHANGED = 0.5
 """Where more of an image changes, it is the light that changes, and nothing is known."""
 LAYERS = (1e-3, 1.0, 30.0)
 """Weights of still pixels, moving ones and fast regions where they meet: what moves lies in front."""
+KEPT = 1 << 28
+"""Bytes of flow that are kept until the regions of all cameras are known; other flow is followed a second time."""
 EXACT = 0.15
 """Largest sigma of the depth that places a region in the world."""
 
@@ -64,9 +68,7 @@ def build_between(store: PriorStore, progress: Callable[[int], None] | None = No
         return 0
     key = hash_of(VERSION, [[camera, frame, record["key"]] for (camera, frame), record in records.items() if record])
     pairs = list(zip(store.frames, store.frames[1:]))
-    entries = [
-        (folder, camera, first) for folder in store.between.values() for camera in store.cameras for first, _ in pairs
-    ]
+    entries = itertools.product(store.between.values(), store.cameras, store.frames[:-1])
     if all(folder.find_current(camera, first, key) for folder, camera, first in entries):
         return 0
     cameras = [CameraMotion(store, name) for name in store.cameras]
@@ -75,7 +77,8 @@ def build_between(store: PriorStore, progress: Callable[[int], None] | None = No
     acceleration = common_acceleration(flights) if even else None
     done = 0
     with store.building(store.path):
-        for camera in cameras:
+        while cameras:
+            camera = cameras.pop(0)
             for index, (first, second) in enumerate(pairs):
                 for quarter, seen in camera.underway(index, acceleration).items():
                     record = {"key": key, "next": second, "shares": seen.shares()}
@@ -94,44 +97,49 @@ class CameraMotion:
         record = store.camera(name, store.frames[0])
         assert record is not None, "a prior of this version describes its camera"
         self.camera = record
-        self.still = still_image([self._image(frame) for frame in spread(store.frames, STILL_INSTANTS)])
+        self._seen = functools.lru_cache(maxsize=4)(self._read)
+        self.still = still_image([self._seen(frame)[1] for frame in spread(store.frames, STILL_INSTANTS)])
         self.regions: list[list[Region]] = []
-        for first, second in zip(store.frames, store.frames[1:]):
-            images = self._image(first), self._image(second)
-            self.regions.append(regions(*images, self.still, *_flows(*images)))
+        self.kept: dict[int, Sequence[np.ndarray]] = {}
+        for index in range(len(store.frames) - 1):
+            _, (earlier, later), (flow, back) = self._ends(index)
+            self.regions.append(regions(earlier, later, self.still, flow, back))
         self.flights = [[self._flight(index, region) for region in each] for index, each in enumerate(self.regions)]
+        self._seen.cache_clear()
 
     def underway(self, index: int, acceleration: np.ndarray | None) -> dict[int, FusedPrior]:
         """The view at each quarter of an interval; nothing of it is known where too much of the image changes."""
-        priors = [self._prior(frame) for frame in self.store.frames[index : index + 2]]
-        images = [prior.colors.numpy() for prior in priors if prior.colors is not None]
-        changed = (np.abs(np.subtract(*images, dtype=np.int16)) > CHANGED).any(-1)
+        cv2, (priors, images, flows) = opencv("scene flow"), self._ends(index)
+        difference = np.maximum.reduce(cv2.split(cv2.absdiff(*images)))
+        changed = difference > CHANGED
         if changed.mean() > MOST_CHANGED:
             unknown = np.full(changed.shape, Label.CONFLICT, np.uint8)
             return dict.fromkeys(QUARTERS, replace(empty_prior(changed.shape), labels=unknown, colors=images[0]))
         for image in images:
             changed |= foreground(image, self.still)
-        flows, bends = _flows(*images), [self._bend(flight, acceleration) for flight in self.flights[index]]
-        return {quarter: _composed(self._sides(index, flows, bends, quarter / 4), changed) for quarter in QUARTERS}
+        layers = [(np.hypot(flow[..., 0], flow[..., 1]) > MOVES).astype(np.uint8) for flow in flows]
+        for region in self.regions[index]:
+            layers[0].flat[region.start] = layers[1].flat[region.end] = 2
+        ends = [_Side(*side, 0.0) for side in zip(priors, images, flows, layers)]
+        maps = changed, difference >= CONTRADICTS, images[0].astype(int) << 8 | images[1]
+        return {quarter: _composed(self._sides(index, ends, acceleration, quarter / 4), *maps) for quarter in QUARTERS}
 
     def flow(self, index: int) -> np.ndarray:
         """How far each pixel goes from one instant of an interval to the next, [H, W, 2] pixels."""
-        flows = _flows(*(self._image(frame) for frame in self.store.frames[index : index + 2]))
-        return self._sides(index, flows, [np.zeros(2)] * len(self.regions[index]), 1.0)[0].steps
+        flow = self._ends(index)[2][0].copy()
+        for region in self.regions[index]:
+            flow.reshape(-1, 2)[region.start] = region.shift
+        return flow
 
-    def _sides(self, index: int, flows: Sequence[np.ndarray], bends: Sequence[np.ndarray], part: float) -> list[_Side]:
+    def _sides(self, index: int, ends: Sequence[_Side], acceleration: np.ndarray | None, part: float) -> list[_Side]:
         """Both instants of an interval, their pixels moved to where they are when that part of it has passed."""
-        priors = [self._prior(frame) for frame in self.store.frames[index : index + 2]]
-        sides = []
-        for flow, which, prior, share in zip(flows, ("start", "end"), priors, (part, 1 - part)):
-            steps, layer = share * flow, (np.hypot(flow[..., 0], flow[..., 1]) > MOVES).astype(np.uint8)
-            for region, bend in zip(self.regions[index], bends):
-                pixels = np.unravel_index(getattr(region, which), region.shape)
-                way = region.shift if which == "start" else -region.shift
-                steps[pixels] = share * way + 4 * part * (1 - part) * bend
-                layer[pixels] = 2
-            sides.append(_Side(prior, steps, layer, 1 - share))
-        return sides
+        parts = part, 1 - part
+        moved = [end._replace(steps=share * end.steps, weight=1 - share) for end, share in zip(ends, parts)]
+        for region, flight in zip(self.regions[index], self.flights[index]):
+            bend = 4 * part * (1 - part) * self._bend(flight, acceleration)
+            moved[0].steps.reshape(-1, 2)[region.start] = part * region.shift + bend
+            moved[1].steps.reshape(-1, 2)[region.end] = (1 - part) * -region.shift + bend
+        return moved
 
     def _flight(self, index: int, region: Region) -> Flight | None:
         """The region's way in the world, with that of the same region in the intervals beside; None without depth."""
@@ -150,7 +158,7 @@ class CameraMotion:
     def _displacement(self, index: int, region: Region) -> tuple[np.ndarray | None, np.ndarray | None]:
         """Where a region begins in the world [3], and how far it goes [3]; None where its depth is not known."""
         ends = zip((region.start, region.end), self.store.frames[index : index + 2])
-        start, end = (_place(pixels, self._prior(frame), self.camera, region.shape) for pixels, frame in ends)
+        start, end = (_place(pixels, self._seen(frame)[0], self.camera, region.shape) for pixels, frame in ends)
         return start, None if start is None or end is None else end - start
 
     def _bend(self, flight: Flight | None, acceleration: np.ndarray | None) -> np.ndarray:
@@ -160,91 +168,96 @@ class CameraMotion:
         middle = flight.start + flight.over / 2
         return _pixel(middle + flight.bend(acceleration), self.camera) - _pixel(middle, self.camera)
 
-    def _prior(self, frame: int) -> DepthPrior:
+    def _ends(self, index: int) -> tuple[Sequence[DepthPrior], Sequence[np.ndarray], Sequence[np.ndarray]]:
+        """The priors at both ends of an interval, their images, and dense flow from either to the other."""
+        priors, images = zip(*(self._seen(frame) for frame in self.store.frames[index : index + 2]))
+        flows = self.kept.get(index) or (dense_flow(*images), dense_flow(*images[::-1]))
+        if len(self.store.cameras) * (index + 1) * 2 * flows[0].nbytes < KEPT:
+            self.kept[index] = flows
+        return priors, images, flows
+
+    def _read(self, frame: int) -> tuple[DepthPrior, np.ndarray]:
         prior = self.store.prior(self.name, frame)
         assert prior is not None, "checked before"
-        return prior
-
-    def _image(self, frame: int) -> np.ndarray:
-        colors = self._prior(frame).colors
-        assert colors is not None, "a store keeps them"
-        return colors.numpy()
+        assert prior.colors is not None, "a store keeps them"
+        return prior, prior.colors.numpy()
 
 
 class _Side(NamedTuple):
     """One of the two instants: what its pixels are, how far each goes, and how much it counts for being near."""
 
     prior: DepthPrior
+    image: np.ndarray  # [H, W, 3]
     steps: np.ndarray  # [H, W, 2] pixels
     layer: np.ndarray  # [H, W] index into LAYERS
     weight: float
 
 
-def _flows(earlier: np.ndarray, later: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    return dense_flow(earlier, later), dense_flow(later, earlier)
+def _composed(sides: Sequence[_Side], changed: np.ndarray, unlike: np.ndarray, pairs: np.ndarray) -> FusedPrior:
+    """The image from both instants' accounts, with the depth of what moves; `changed` [H, W] says where.
 
-
-def _composed(sides: Sequence[_Side], changed: np.ndarray) -> FusedPrior:
-    """The image from both instants' accounts, with the depth of what moves; `changed` [H, W] says where."""
-    accounts = [2 * side.weight * _account(side) for side in sides]
-    both = np.minimum(accounts[0][..., 3], accounts[1][..., 3]) > 1e-2 * LAYERS[0]
-    colors = [account[..., :3] / np.maximum(account[..., 3:], 1e-9) for account in accounts]
-    # A region that was found back is there, whatever its colours: a ball spins.
-    found = np.minimum(accounts[0][..., 3], accounts[1][..., 3]) > 0.1 * LAYERS[2]
-    differ = both & ~found & (np.abs(colors[0] - colors[1]).max(-1) > CONTRADICTS)
+    Where the weight is that of still pixels alone, and these are not `unlike` [H, W], the colours are looked up by
+    `pairs` [H, W, 3]: 256 times the earlier one, and the later one.
+    """
+    accounts = [_account(side) for side in sides]
+    mixed = unlike | (accounts[0][3] != LAYERS[0]) | (accounts[1][3] != LAYERS[0])
+    accounts = [2 * side.weight * account[:, mixed] for side, account in zip(sides, accounts)]
+    colors = [account[:3] / np.maximum(account[3], 1e-9) for account in accounts]
+    least, differ = np.minimum(accounts[0][3], accounts[1][3]), np.zeros(changed.shape, np.float32)
+    # A region that was found back, and so weighs much, is there whatever its colours: a ball spins.
+    compared = (least > 1e-2 * LAYERS[0]) & (least <= 0.1 * LAYERS[2])
+    differ[mixed] = compared & (np.abs(colors[0] - colors[1]).max(0) > CONTRADICTS)
     together = accounts[0] + accounts[1]
-    known = together[..., 3] > 0.1 * LAYERS[0]
-    unknown = ~known | (opencv("scene flow").blur(differ.astype(np.float32), (3, 3)) > 0.3)
-    depth, sigma, labels = _depths(sides)
-    kept = (changed | (together[..., 3] > LAYERS[1] / 2)) & ~unknown & (depth > 0)
-    image = np.rint(together[..., :3] / np.maximum(together[..., 3:], 1e-9)).astype(np.uint8)
-    return FusedPrior(
-        np.where(kept, depth, 0).astype(np.float32),
-        np.where(unknown, np.uint8(Label.CONFLICT), np.where(kept, labels, np.uint8(Label.EMPTY))),
-        np.where(kept, sigma, np.inf).astype(np.float32),
-        image,
-    )
+    unknown = opencv("scene flow").blur(differ, (3, 3)) > 0.3
+    unknown[mixed] |= together[3] <= 0.1 * LAYERS[0]
+    kept, origin = changed.copy(), _origin(sides)
+    kept[mixed] |= together[3] > LAYERS[1] / 2
+    kept &= ~unknown & (origin >= 0)
+    still = LAYERS[0] * np.arange(256)
+    table = (2 * sides[0].weight * still[:, None] + 2 * sides[1].weight * still) / (2 * LAYERS[0])
+    image = np.rint(table).astype(np.uint8).take(pairs)
+    image[mixed] = np.rint(together[:3] / np.maximum(together[3], 1e-9)).T
+    seen = replace(empty_prior(kept.shape), colors=image)
+    for name, values in (("depth", seen.depth), ("sigma", seen.sigma), ("labels", seen.labels)):
+        values[kept] = np.stack([getattr(side.prior, name) for side in sides]).take(origin[kept])
+    seen.labels[unknown] = Label.CONFLICT
+    return seen
 
 
 def _account(side: _Side) -> np.ndarray:
-    """Weighted colours and their weight [H, W, 4] of one side's pixels there, by linear splatting."""
+    """Weighted colours and their weight [4, H, W] of one side's pixels there, by linear splatting."""
     height, width = side.layer.shape
+    total = np.zeros((4, height + 3, width + 3))  # what leaves the image lands on its rim
+    inner = total[:, 1:-2, 1:-2]
+    inner[3] = np.where(side.layer == 0, LAYERS[0], 0.0)
+    inner[:3] = np.moveaxis(side.image, -1, 0) * inner[3]
     rows, columns = np.nonzero(side.layer)
-    assert side.prior.colors is not None
-    colors = side.prior.colors.numpy().astype(np.float64)
-    still = np.where(side.layer == 0, LAYERS[0], 0.0)[..., None]
-    total = np.concatenate([colors * still, still], -1).reshape(-1, 4)
-    x, y = columns + side.steps[rows, columns, 0], rows + side.steps[rows, columns, 1]
-    values = np.concatenate([colors[rows, columns], np.ones((len(rows), 1))], 1)
-    values *= np.array(LAYERS)[side.layer[rows, columns]][:, None]
+    values = np.vstack([side.image[rows, columns].T, np.ones(len(rows))]) * np.array(LAYERS)[side.layer[rows, columns]]
+    x = np.clip(columns + side.steps[rows, columns, 0], -1, width)
+    y = np.clip(rows + side.steps[rows, columns, 1], -1, height)
     left, top = np.floor(x), np.floor(y)
     for column, row in ((0, 0), (0, 1), (1, 0), (1, 1)):
         share = (1 - np.abs(x - left - column)) * (1 - np.abs(y - top - row))
-        inside = (left + column >= 0) & (left + column < width) & (top + row >= 0) & (top + row < height)
-        place = ((top + row) * width + left + column)[inside].astype(np.int64)
-        for channel in range(4):
-            weights = (values[:, channel] * share)[inside]
-            total[:, channel] += np.bincount(place, weights, minlength=height * width)
-    return total.reshape(height, width, 4)
+        place = ((top + row + 1) * (width + 3) + left + column + 1).astype(np.int64)
+        for plane, value in zip(total, values):
+            plane += np.bincount(place, value * share, plane.size).reshape(plane.shape)
+    return inner
 
 
-def _depths(sides: Sequence[_Side]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """D*, sigma and label [H, W] of what moves, each pixel carried to the nearest one; later layers win."""
+def _origin(sides: Sequence[_Side]) -> np.ndarray:
+    """The pixel of both sides' [2 H W] that is carried to each one [H, W], -1 where none is; later layers win."""
     height, width = sides[0].layer.shape
-    depth, labels = np.zeros((height, width)), np.zeros((height, width), np.uint8)
-    sigma = np.full((height, width), np.inf)
+    origin = np.full(height * width, -1)
     for layer in range(len(LAYERS)):
-        for side in sides:
-            known = (side.layer == layer) & (side.prior.depth.numpy() > 0)
-            rows, columns = np.nonzero(known)
-            step = np.rint(side.steps[rows, columns] * (layer > 0)).astype(int)
-            column, row = columns + step[:, 0], rows + step[:, 1]
-            inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-            to, source = (row[inside], column[inside]), (rows[inside], columns[inside])
-            assert side.prior.sigma is not None
-            depth[to], labels[to] = side.prior.depth.numpy()[source], side.prior.labels.numpy()[source]
-            sigma[to] = side.prior.sigma.numpy()[source]
-    return depth, sigma, labels
+        for index, side in enumerate(sides):
+            pixels = target = np.flatnonzero((side.layer == layer) & (side.prior.depth.numpy() > 0))
+            if layer > 0:
+                rows, columns = np.divmod(pixels, width)
+                column, row = np.rint(side.steps.reshape(-1, 2)[pixels]).astype(int).T + (columns, rows)
+                inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+                pixels, target = pixels[inside], (row * width + column)[inside]
+            origin[target] = index * origin.size + pixels
+    return origin.reshape(height, width)
 
 
 def _place(pixels: np.ndarray, prior: DepthPrior, camera: CameraRecord, shape: tuple[int, ...]) -> np.ndarray | None:

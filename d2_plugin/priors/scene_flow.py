@@ -54,7 +54,7 @@ def still_image(images: Sequence[np.ndarray]) -> np.ndarray:
 def foreground(image: np.ndarray, still: np.ndarray) -> np.ndarray:
     """Pixels [H, W] that differ from the still image, without specks."""
     cv2 = opencv("scene flow")
-    differs = (np.abs(image - still).max(-1) > FOREGROUND).astype(np.uint8)
+    differs = (np.maximum.reduce(cv2.split(np.abs(image - still))) > FOREGROUND).astype(np.uint8)
     closed = cv2.morphologyEx(differs, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
     opened: np.ndarray = cv2.morphologyEx(closed, cv2.MORPH_OPEN, np.ones((2, 2), np.uint8)) > 0
     return opened
@@ -72,16 +72,11 @@ def dense_flow(image: np.ndarray, other: np.ndarray) -> np.ndarray:
 def followed(image: np.ndarray, other: np.ndarray, flow: np.ndarray, back: np.ndarray) -> np.ndarray:
     """Pixels [H, W] of `image` that the flow follows: `back` returns, and the colours are alike."""
     cv2 = opencv("scene flow")
-    height, width = flow.shape[:2]
-    rows, columns = np.mgrid[:height, :width].astype(np.float32)
+    rows, columns = np.indices(flow.shape[:2], np.float32)
     target = columns + flow[..., 0], rows + flow[..., 1]
-
-    def there(values: np.ndarray) -> np.ndarray:
-        warped: np.ndarray = cv2.remap(values, *target, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        return warped
-
-    returns = np.linalg.norm(flow + there(back), axis=-1) < RETURNS
-    differs = np.abs(image.astype(np.float32) - there(other).astype(np.float32)).max(-1)
+    there = [cv2.remap(values, *target, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for values in (back, other)]
+    returns = np.sqrt(sum(component**2 for component in cv2.split(flow + there[0]))) < RETURNS
+    differs = np.maximum.reduce(cv2.split(cv2.absdiff(image, there[1]))).astype(np.float32)
     return returns & (cv2.GaussianBlur(differs, (0, 0), 1) < RESEMBLES)
 
 
@@ -112,22 +107,18 @@ def regions(
         flow, back: dense flow from the earlier image to the later one, and back.
     """
     fronts = foreground(earlier, still), foreground(later, still)
-    lost = fronts[0] & ~followed(earlier, later, flow, back), fronts[1] & ~followed(later, earlier, back, flow)
+    ends = [(image, front, *_small(image, front)) for image, front in zip((earlier, later), fronts)]
     matched: list[Region] = []
-    for images, masks, unexplained, forwards in (
-        ((earlier, later), fronts, lost[0], True),
-        ((later, earlier), fronts[::-1], lost[1], False),
-    ):
-        for mask in _pieces(masks[0], unexplained):
-            shift, cost = _match(*images, mask, masks[1])
-            landed = _moved(mask, shift) & masks[1]
-            worst = WORST_ALONE if _lands_alone(landed, masks[1]) else WORST_MATCH
-            if cost > worst or np.hypot(*shift) < 3 or landed.sum() <= SMALLEST:
+    for one, other, flows in ((*ends, (flow, back)), (*ends[::-1], (back, flow))):
+        for mask in _pieces(one[1], one[1] & ~followed(one[0], other[0], *flows)):
+            shift, cost = _match(one, other, mask)
+            landed = (_window(mask.view(np.uint8), -shift, mask.shape[::-1]) > 0) & other[1]
+            if np.hypot(*shift) < 3 or np.count_nonzero(landed) <= SMALLEST or cost > _worst_cost(landed, other[1]):
                 continue
-            back_again, _ = _match(*images[::-1], landed, masks[0])
+            back_again, _ = _match(other, one, landed)
             if np.abs(shift + back_again).sum() <= 3:
                 here, there = np.flatnonzero(mask), np.flatnonzero(landed)
-                start, end, way = (here, there, shift) if forwards else (there, here, -shift)
+                start, end, way = (here, there, shift) if one is ends[0] else (there, here, -shift)
                 matched.append(Region(start, end, way, cost, still.shape[:2]))
     return sorted(matched, key=lambda region: -region.cost)
 
@@ -135,44 +126,47 @@ def regions(
 def _pieces(front: np.ndarray, unexplained: np.ndarray) -> Iterator[np.ndarray]:
     """The masks of what is to be matched: whole foreground components, or the unexplained parts of them."""
     cv2 = opencv("scene flow")
-    unexplained = cv2.morphologyEx(unexplained.astype(np.uint8), cv2.MORPH_OPEN, np.ones((2, 2), np.uint8)) > 0
+    unexplained = cv2.morphologyEx(unexplained.view(np.uint8), cv2.MORPH_OPEN, np.ones((2, 2), np.uint8)) > 0
     for component in _components(front, SMALLEST):
-        share = (unexplained & component).sum() / component.sum()
+        lost = unexplained & component
+        share = np.count_nonzero(lost) / np.count_nonzero(component)
         if share > UNFOLLOWED:
             yield component
         elif share > 0:
-            for part in _components(unexplained & component, 20):
-                yield (cv2.dilate(part.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0) & component
+            for part in _components(lost, 20):
+                yield (cv2.dilate(part.view(np.uint8), np.ones((5, 5), np.uint8)) > 0) & component
 
 
-def _lands_alone(landed: np.ndarray, front: np.ndarray) -> bool:
-    """Whether what pixels land on is a thing of their size, not part of a larger one."""
-    labels = opencv("scene flow").connectedComponents(front.astype(np.uint8))[1]
-    return bool(landed.sum() > ALONE * np.isin(labels, np.unique(labels[landed])).sum())
+def _worst_cost(landed: np.ndarray, front: np.ndarray) -> float:
+    """Of a match: more if what its pixels land on is a thing of their size, not part of a larger one."""
+    labels = opencv("scene flow").connectedComponents(front.view(np.uint8))[1]
+    touched = np.bincount(labels.ravel())[np.unique(labels[landed])].sum()
+    return WORST_ALONE if np.count_nonzero(landed) > ALONE * touched else WORST_MATCH
 
 
 def _components(mask: np.ndarray, least: int) -> Iterator[np.ndarray]:
-    count, labels, statistics, _ = opencv("scene flow").connectedComponentsWithStats(mask.astype(np.uint8))
+    count, labels, statistics, _ = opencv("scene flow").connectedComponentsWithStats(mask.view(np.uint8))
     return (labels == index for index in range(1, count) if statistics[index, 4] >= least)
 
 
-def _match(image: np.ndarray, other: np.ndarray, mask: np.ndarray, front: np.ndarray) -> tuple[np.ndarray, float]:
-    """The shift [2] at which the pixels of a mask look alike in the other image and land on its foreground; its cost.
+def _small(*maps: np.ndarray) -> list[np.ndarray]:
+    """The maps about `FINE_WIDTH` wide, float32."""
+    cv2, factor = opencv("scene flow"), max(1, round(maps[0].shape[1] / FINE_WIDTH))
+    size = [length // factor for length in maps[0].shape[1::-1]]
+    return [cv2.resize(map_.astype(np.float32), size, interpolation=cv2.INTER_AREA) for map_ in maps]
 
-    The nearer of two equal matches is taken.
+
+def _match(one: Sequence[np.ndarray], other: Sequence[np.ndarray], mask: np.ndarray) -> tuple[np.ndarray, float]:
+    """The shift [2] at which the pixels of a mask look alike at the other instant and land on its foreground; its cost.
+
+    An instant is its image and foreground, and both `_small`. The nearer of two equal matches is taken.
     """
     factor, reach = max(1, round(mask.shape[1] / FINE_WIDTH)), mask.shape[1] // REACH
-    near = np.zeros(2, int)
-    if factor > 1:
-        size = mask.shape[1] // factor, mask.shape[0] // factor
-        small = [
-            opencv("scene flow").resize(map_.astype(np.float32), size, interpolation=3)  # by area
-            for map_ in (image, other, mask, front)
-        ]
-        if (small[2] > 0.5).any():
-            shift, _ = _search(small[0], small[1], small[2] > 0.5, small[3] > 0.5, near, reach // factor)
-            near, reach = factor * shift.astype(int), factor
-    return _search(image, other, mask, front, near, reach)
+    near, small = np.zeros(2, int), _small(mask)[0] > 0.5
+    if factor > 1 and small.any():
+        shift, _ = _search(one[2], other[2], small, other[3] > 0.5, near, reach // factor)
+        near, reach = factor * shift.astype(int), factor
+    return _search(one[0], other[0], mask, other[1], near, reach)
 
 
 def _search(
@@ -180,32 +174,25 @@ def _search(
 ) -> tuple[np.ndarray, float]:
     """The best shift [2] of those that differ from `near` by `reach` at most, and its cost."""
     cv2 = opencv("scene flow")
-    rows, columns = np.nonzero(mask)
-    box = slice(rows.min(), rows.max() + 1), slice(columns.min(), columns.max() + 1)
-    rim = reach + int(np.abs(near).max())
-    window = tuple(
-        slice(side.start + rim + shift - reach, side.stop + rim + shift + reach) for side, shift in zip(box, near[::-1])
-    )
-    padded = [
-        cv2.copyMakeBorder(map_.astype(np.float32), rim, rim, rim, rim, cv2.BORDER_CONSTANT)[window]
-        for map_ in (other, front)
-    ]
+    left, top, width, height = cv2.boundingRect(mask.view(np.uint8))
+    box = slice(top, top + height), slice(left, left + width)
+    corner, size = np.array([left, top]) + near - reach, (width + 2 * reach, height + 2 * reach)
+    colors, lands = (_window(map_, corner, size).astype(np.float32) for map_ in (other, front.view(np.uint8)))
     weight = mask[box].astype(np.float32)
     channels = np.repeat(weight[..., None], 3, 2)
-    squares = cv2.matchTemplate(padded[0], image[box].astype(np.float32), cv2.TM_SQDIFF, mask=channels)
-    beside = 1 - cv2.matchTemplate(padded[1], weight, cv2.TM_CCORR) / weight.sum()
+    squares = cv2.matchTemplate(colors, image[box].astype(np.float32), cv2.TM_SQDIFF, mask=channels)
+    beside = 1 - cv2.matchTemplate(lands, weight, cv2.TM_CCORR) / weight.sum()
     cost = np.sqrt(np.maximum(squares, 0) / (3 * weight.sum())) + LANDS_BESIDE * beside
     down, across = np.mgrid[-reach : reach + 1, -reach : reach + 1] + near[::-1, None, None]
     row, column = np.unravel_index(np.argmin(cost + 0.05 * np.hypot(down, across)), cost.shape)
     return np.array([across[row, column], down[row, column]], float), float(cost[row, column])
 
 
-def _moved(mask: np.ndarray, shift: np.ndarray) -> np.ndarray:
-    """The mask shifted by whole pixels."""
-    cv2 = opencv("scene flow")
-    moving = np.array([[1, 0, shift[0]], [0, 1, shift[1]]], np.float32)
-    moved: np.ndarray = cv2.warpAffine(mask.astype(np.uint8), moving, mask.shape[::-1], flags=cv2.INTER_NEAREST) > 0
-    return moved
+def _window(values: np.ndarray, corner: np.ndarray, size: tuple[int, ...]) -> np.ndarray:
+    """The part of an image that begins at (column, row) and has a size (columns, rows); 0 beyond the image."""
+    cv2, moving = opencv("scene flow"), np.array([[1, 0, -corner[0]], [0, 1, -corner[1]]], np.float32)
+    window: np.ndarray = cv2.warpAffine(values, moving, size, flags=cv2.INTER_NEAREST)
+    return window
 
 
 @dataclass(frozen=True, eq=False)
