@@ -288,15 +288,18 @@ class SplatModel(ABC):
 
     @torch.no_grad()
     def leave_out_hidden(self, views: Sequence[View]) -> None:
-        """Delete the Gaussians that hardly show in any of the views, nor halfway to the next instant of its camera."""
+        """Delete the Gaussians that hardly show in any of the views, nor halfway to the next instant of its camera, and
+        those whose centre no camera sees then."""
         ordered = sorted(views, key=lambda view: (view.camera, view.time))
         between = [replace(a, time=(a.time + b.time) / 2) for a, b in pairwise(ordered) if a.camera == b.camera]
         largest = torch.zeros(len(self), device=self.gaussians.device)
+        seen = torch.zeros_like(largest, dtype=torch.bool)
         for view in ordered + between:
             splats, empty = self.slice_at(view), view.K.new_zeros(view.height, view.width)
             weights = survey(splats, view, DepthPrior(empty, empty.byte()), self.settings.raster).max_weight
             largest.scatter_reduce_(0, splats.rows, weights, "amax")
-        self.select(torch.nonzero(largest >= HARDLY).squeeze(1))
+            seen[splats.rows] |= view.sees(splats.means)
+        self.select(torch.nonzero((largest >= HARDLY) & seen).squeeze(1))
 
     def _report_resize(self, index: Tensor) -> None:
         for observer in self.observers:

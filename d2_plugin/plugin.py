@@ -296,10 +296,9 @@ class D2Hooks:
             return self._sampler.sample(max(self.config.views_per_evaluation, first), self.generator)
 
         assert self.prior is not None, "a step without hooks has no context"
-        instants, motion = self._sampler.instants, self.config.motion
-        halfway = motion is not None and motion.insert
-        now = schedule_step(self.backbone, step)
-        return Context(now, self.backbone, views, self.prior, self.generator, sample, instants, halfway)
+        known, motion = self._sampler, self.config.motion
+        seen = sample, known.instants, known.beside, motion is not None and motion.insert
+        return Context(schedule_step(self.backbone, step), self.backbone, views, self.prior, self.generator, *seen)
 
     def _retire_if_idle(self, step: int, name: str, edit: Edit | None, context: Context) -> None:
         if name not in HOOKS or not HOOKS[name].edits_structure or not context.evaluation:

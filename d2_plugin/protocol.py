@@ -48,6 +48,12 @@ class View:
     width: int
     height: int
 
+    def sees(self, points: Tensor) -> Tensor:
+        """Which world points [K, 3] lie before the camera and in its image, hidden or not: bool [K]."""
+        pose = self.T_camera_world.to(points)
+        x, y, z = ((points @ pose[:3, :3].T + pose[:3, 3]) @ self.K.to(points).T).unbind(-1)
+        return (z > 0) & (x >= 0) & (x < self.width * z) & (y >= 0) & (y < self.height * z)
+
 
 class Splats(NamedTuple):
     """3D Gaussians at one instant, differentiable with respect to the backbone's parameters.

@@ -164,7 +164,7 @@ class TestRetirement:
     def config(**top: object) -> D2Config:
         nothing = {
             "densify": DensifyConfig(start=1, stop=None, every=1, max_gaussians=0),
-            "prune": PruneConfig(start=1, stop=None, every=1, patience=3, tau_p=1.0),
+            "prune": PruneConfig(start=1, stop=None, every=1, patience=3, tau_p=1.0, sight=False),
         }
         return D2Config(**nothing, views_per_evaluation=3, **top)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, NamedTuple
 
@@ -11,7 +11,7 @@ from torch import Tensor
 
 from d2_plugin.hooks.hook import Context, Hook, HookConfig, Surveyed, steps_between_evaluations
 from d2_plugin.hooks.rendered_depth import EPSILON
-from d2_plugin.protocol import Edit
+from d2_plugin.protocol import Edit, View
 from d2_plugin.settings import Every, Range, Share, Steps
 
 AT_LEAST = 10
@@ -50,6 +50,9 @@ class PruneConfig(HookConfig):
     free_space: bool = True
     """Whether standing in space that the prior says is free counts as inconsistency too, and removes after
     `score_stop`; the paper has no such term."""
+    sight: bool = True
+    """Whether Gaussians go whose centre no camera sees; the paper has no such term. Images train their rim alone: they
+    may grow into what held-out cameras see, and nothing tells."""
     light: Share = 0.05
     """Largest share of the light in the surveyed views that one evaluation takes away: the faintest go first, the rest
     waits with its evidence for the next. 1 sets no limit, as the paper. What a random start has in front of every
@@ -121,6 +124,18 @@ def floating(sums: Sums) -> Tensor:
     return enough & (sums.front > FLOATS * (sums.weight - sums.front))
 
 
+def out_of_sight(evaluation: Sequence[Surveyed], beside: Callable[[View], Sequence[View]], count: int) -> Tensor:
+    """Gaussians [N] that live in an evaluated view, and whose centre lies in no image of any camera then, bool.
+
+    `beside` gives a view of each camera for an evaluated one.
+    """
+    alive, seen = torch.zeros(2, count, dtype=torch.bool, device=evaluation[0].splats.rows.device)
+    for view, splats, _, _ in evaluation:
+        alive[splats.rows] = True
+        seen[splats.rows] |= torch.stack([other.sees(splats.means) for other in beside(view)]).any(0)
+    return alive & ~seen
+
+
 def within_light(remove: Tensor, weight: Tensor, share: float) -> Tensor:
     """Of the rows of `remove` [N], the faintest that together carry at most `share` of all `weight` [N]; at least one,
     so that a bright floater that is alone goes, too."""
@@ -160,6 +175,8 @@ class Prune(Hook):
         updated = torch.where(high, self.streak + 1, torch.zeros_like(self.streak))
         self.streak = torch.where(sums.weight > 0, updated, self.streak)
         remove = within_light(self.streak >= config.patience, sums.weight, config.light)
+        if config.sight:
+            remove = remove | out_of_sight(context.evaluation, context.beside, count)
         return Edit(remove=remove) if remove.any() else None
 
     def follow(self, index: Tensor) -> None:

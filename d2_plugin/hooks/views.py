@@ -39,6 +39,11 @@ class ViewSampler:
         """The known views of one camera, in the order in which they were first seen."""
         return [view for view in self._views.values() if view.camera == camera]
 
+    def beside(self, view: View) -> list[View]:
+        """A known view of each camera, of the frame of `view` where there is one."""
+        latest = {other.camera: other for other in self._views.values()}
+        return [self._views.get((camera, view.frame), other) for camera, other in latest.items()]
+
     def sample(self, count: int, generator: torch.Generator) -> Sequence[View]:
         """At most `count` different views; over several calls every known view comes once before any comes again."""
         cameras = sorted({camera for camera, _ in self._views})

@@ -26,11 +26,12 @@ from d2_plugin.hooks.prune import (
     pruning_score,
     within_light,
 )
+from d2_plugin.hooks.views import ViewSampler
 from d2_plugin.plugin import D2Hooks
 from d2_plugin.protocol import DepthPrior, Edit, Label, RasterSettings, Splats, View
 from d2_plugin.rasterizer import rasterize
 
-EVERY_ONE = PruneConfig(patience=1, light=1)
+EVERY_ONE = PruneConfig(patience=1, light=1, sight=False)
 
 
 class Fixed:
@@ -46,6 +47,13 @@ class Fixed:
 
     def slice_at(self, view: View) -> Splats:
         return self.splats
+
+
+class OneMore(Fixed):
+    """The same with a Gaussian that does not live now."""
+
+    def __len__(self) -> int:
+        return len(self.splats.means) + 1
 
 
 def double(view: View) -> View:
@@ -222,7 +230,9 @@ def test_far_pixels_alone_reach_the_hook_through_the_plugin() -> None:
     """A prior of sky alone removes translucent Gaussians before it, through D2Hooks and a real backbone."""
     everywhere = torch.full((HEIGHT, WIDTH), int(Label.FAR), dtype=torch.uint8)
     sky = DepthPrior(torch.full((HEIGHT, WIDTH), 50.0), everywhere, sigma=torch.full((HEIGHT, WIDTH), torch.inf))
-    config = replace(ALL_HOOKS, densify=None, depth_loss=None, prune=PruneConfig(start=1, every=1, patience=1, light=1))
+    config = replace(
+        ALL_HOOKS, densify=None, depth_loss=None, prune=PruneConfig(start=1, every=1, patience=1, light=1, sight=False)
+    )
     left = {}
     for free_space in (True, False):
         model = make_model()
@@ -233,6 +243,21 @@ def test_far_pixels_alone_reach_the_hook_through_the_plugin() -> None:
         d2.step(1)
         left[free_space] = len(model)
     assert left[True] < left[False] == 60
+
+
+@pytest.mark.parametrize("sight", [True, False])
+def test_whose_centre_no_camera_sees_goes_at_once_however_much_of_its_rim_shows(sight: bool) -> None:
+    """The first is seen by the left camera alone, which is not evaluated; the second, third by none; nothing is known
+    of the last one's instant."""
+    views, wall = make_views(), TinyStore().prior("", 0)
+    means = torch.tensor([[-1.9, 0.0, 3.0], [0.0, 1.3, 3.0], [0.0, 0.0, -3.0]])
+    here = Splats(means, 0.3**2 * torch.tensor([[1.0, 0, 0, 1, 0, 1]] * 3), torch.full((3,), 0.9), torch.arange(3))
+    known = ViewSampler()
+    for view in views:
+        known.add(view)
+    found = replace(context(here, views[2:3], wall), beside=known.beside, backbone=OneMore(here))
+    edit = Prune(replace(EVERY_ONE, tau_p=1.0, sight=sight)).edit(found)
+    assert (None if edit is None else edit.remove.tolist()) == ([False, True, True, False] if sight else None)
 
 
 def test_the_faintest_go_first_and_the_rest_waits() -> None:
