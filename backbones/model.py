@@ -8,7 +8,6 @@ from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Annotated, Any, TypeVar
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -213,7 +212,7 @@ class SplatModel(ABC):
         splats = self.slice_at(view)
         colors = self.colors_seen(view, splats)
         self._drawn = splats.rows
-        self.screen_offsets = _zeros(splats.means).requires_grad_(torch.is_grad_enabled())
+        self.screen_offsets = splats.means.new_zeros(len(colors), 2, requires_grad=torch.is_grad_enabled())
         if background is not None:
             background = changed(background, self.change(view))
         render = rasterize(
@@ -288,18 +287,15 @@ class SplatModel(ABC):
 
     @torch.no_grad()
     def leave_out_hidden(self, views: Sequence[View]) -> None:
-        """Delete the Gaussians that hardly show in any of the views, nor halfway to the next instant of its camera, and
-        those whose centre no camera sees then."""
+        """Delete the Gaussians that hardly show in any of the views, nor halfway to the next instant of its camera."""
         ordered = sorted(views, key=lambda view: (view.camera, view.time))
         between = [replace(a, time=(a.time + b.time) / 2) for a, b in pairwise(ordered) if a.camera == b.camera]
         largest = torch.zeros(len(self), device=self.gaussians.device)
-        seen = torch.zeros_like(largest, dtype=torch.bool)
         for view in ordered + between:
             splats, empty = self.slice_at(view), view.K.new_zeros(view.height, view.width)
             weights = survey(splats, view, DepthPrior(empty, empty.byte()), self.settings.raster).max_weight
             largest.scatter_reduce_(0, splats.rows, weights, "amax")
-            seen[splats.rows] |= view.sees(splats.means)
-        self.select(torch.nonzero((largest >= HARDLY) & seen).squeeze(1))
+        self.select(torch.nonzero(largest >= HARDLY).squeeze(1))
 
     def _report_resize(self, index: Tensor) -> None:
         for observer in self.observers:
@@ -319,13 +315,6 @@ class SplatModel(ABC):
         self.appearance = Appearance(self.gaussians.device) if "appearance" in state else None
         if self.appearance is not None:
             self.appearance.load_state_dict(state["appearance"])
-
-
-def _zeros(means: Tensor) -> Tensor:
-    """Offsets [M, 2] of centres [M, 3]. On the CPU not by torch, which wakes threads of its own for many."""
-    if means.device.type == "cpu" and means.dtype == torch.float32:
-        return torch.from_numpy(np.zeros((len(means), 2), np.float32))
-    return means.new_zeros(len(means), 2)
 
 
 def learning_rates(settings: SplatSettings, extent: float, duration: float) -> dict[str, float]:

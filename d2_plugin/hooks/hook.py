@@ -89,7 +89,8 @@ class Context:
     instants: Callable[[str], Sequence[View]] = field(default=lambda camera: ())
     """The views of a camera that were trained on so far, in the order in which they were first seen."""
     beside: Callable[[View], Sequence[View]] = field(default=lambda view: (view,))
-    """A view of each camera that was trained on so far, of the frame of a given one where that is known."""
+    """A view of each camera that was trained on so far, of the frame of a given one where that is known; none where a
+    camera moves: others of its instants may see what this one does not."""
     inserts_halfway: bool = False
     """Whether `halfway` is evaluated as well."""
 

@@ -127,12 +127,13 @@ def floating(sums: Sums) -> Tensor:
 def out_of_sight(evaluation: Sequence[Surveyed], beside: Callable[[View], Sequence[View]], count: int) -> Tensor:
     """Gaussians [N] that live in an evaluated view, and whose centre lies in no image of any camera then, bool.
 
-    `beside` gives a view of each camera for an evaluated one.
+    `beside` gives a view of each camera for an evaluated one; none where they move, and then nothing is said.
     """
     alive, seen = torch.zeros(2, count, dtype=torch.bool, device=evaluation[0].splats.rows.device)
     for view, splats, _, _ in evaluation:
-        alive[splats.rows] = True
-        seen[splats.rows] |= torch.stack([other.sees(splats.means) for other in beside(view)]).any(0)
+        for other in beside(view):
+            alive[splats.rows] = True
+            seen[splats.rows] |= other.sees(splats.means)
     return alive & ~seen
 
 

@@ -21,12 +21,15 @@ class ViewSampler:
         self._views: dict[tuple[str, int], View] = {}
         self._queues: dict[str, list[int]] = {}
         self._next_camera = 0
+        self._moving = False
 
     def add(self, view: View) -> bool:
         """Remember a view; whether it was not known before."""
         new = (view.camera, view.frame) not in self._views
         if new:
             check_view(view)
+            poses = [known.T_camera_world for known in self.instants(view.camera)[:1]]
+            self._moving |= not all(torch.equal(pose, view.T_camera_world) for pose in poses)
             self._views[view.camera, view.frame] = view
         return new
 
@@ -40,8 +43,8 @@ class ViewSampler:
         return [view for view in self._views.values() if view.camera == camera]
 
     def beside(self, view: View) -> list[View]:
-        """A known view of each camera, of the frame of `view` where there is one."""
-        latest = {other.camera: other for other in self._views.values()}
+        """A known view of each camera, of the frame of `view` where there is one; none at all where a camera moves."""
+        latest = {} if self._moving else {other.camera: other for other in self._views.values()}
         return [self._views.get((camera, view.frame), other) for camera, other in latest.items()]
 
     def sample(self, count: int, generator: torch.Generator) -> Sequence[View]:
@@ -72,6 +75,8 @@ class ViewSampler:
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from `state_dict()`."""
-        self._views = {(v["camera"], v["frame"]): View(**v) for v in state["views"]}
+        self._views, self._moving = {}, False
+        for view in state["views"]:
+            self.add(View(**view))
         self._queues = {camera: list(queue) for camera, queue in state["queues"].items()}
         self._next_camera = state["next_camera"]

@@ -196,22 +196,6 @@ def test_what_hardly_shows_is_left_out_at_the_end_of_a_run(backbone: str) -> Non
         torch.testing.assert_close(model.render(view).color, image, atol=0.02, rtol=0)
 
 
-def test_a_gaussian_whose_centre_no_camera_sees_is_left_out(backbone: str) -> None:
-    """The lower edge of all images is at y = .4; the second Gaussian's rim shows in them."""
-    at = Points(
-        torch.tensor([[0.0, 0.36, 1], [0.0, 0.44, 1]]),
-        torch.rand(2, 3, generator=torch.Generator().manual_seed(2)),
-        torch.full((2,), 0.25),
-        torch.full((2,), 0.1),
-        torch.full((2,), 0.3),
-    )
-    model = make_model(backbone=backbone)
-    model.select(torch.arange(0))
-    model.append(model.initial_rows(at, model.settings, model.duration))
-    model.leave_out_hidden(make_views())
-    torch.testing.assert_close(model.gaussians["positions"].detach(), at.positions[:1])
-
-
 @pytest.mark.parametrize(("iterations", "looks"), [(23, False), (24, True)])
 def test_a_run_of_four_steps_for_each_view_ends_with_a_look_at_each(
     backbone: str, iterations: int, looks: bool

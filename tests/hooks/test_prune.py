@@ -258,6 +258,9 @@ def test_whose_centre_no_camera_sees_goes_at_once_however_much_of_its_rim_shows(
     found = replace(context(here, views[2:3], wall), beside=known.beside, backbone=OneMore(here))
     edit = Prune(replace(EVERY_ONE, tau_p=1.0, sight=sight)).edit(found)
     assert (None if edit is None else edit.remove.tolist()) == ([False, True, True, False] if sight else None)
+    pose = views[2].T_camera_world + torch.tensor([[0.0, 0, 0, 1], *3 * [[0] * 4]])
+    known.add(replace(views[2], frame=7, T_camera_world=pose))  # other instants of a moving camera may see them
+    assert Prune(replace(EVERY_ONE, tau_p=1.0, sight=sight)).edit(found) is None
 
 
 def test_the_faintest_go_first_and_the_rest_waits() -> None:
