@@ -5,7 +5,6 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
 from typing import Annotated, Any, TypeVar
 
 import torch
@@ -289,7 +288,8 @@ class SplatModel(ABC):
     def leave_out_hidden(self, views: Sequence[View]) -> None:
         """Delete the Gaussians that hardly show in any of the views, nor halfway to the next instant of its camera."""
         ordered = sorted(views, key=lambda view: (view.camera, view.time))
-        between = [replace(a, time=(a.time + b.time) / 2) for a, b in pairwise(ordered) if a.camera == b.camera]
+        following = ordered[1:]
+        between = [replace(a, time=(a.time + b.time) / 2) for a, b in zip(ordered, following) if a.camera == b.camera]
         largest = torch.zeros(len(self), device=self.gaussians.device)
         for view in ordered + between:
             splats, empty = self.slice_at(view), view.K.new_zeros(view.height, view.width)
