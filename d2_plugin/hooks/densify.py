@@ -115,12 +115,9 @@ def frustum_cells(view: View, points: Tensor, stride: float, depth_step: float) 
     uncertainty does. Two points in one cell describe the same piece of surface.
     """
     pose, K = view.T_camera_world.to(points), view.K.to(points)
-    camera = points @ pose[:3, :3].T + pose[:3, 3]
-    z = camera[:, 2]
-    front = z > 0
-    safe = torch.where(front, z, torch.ones_like(z))
+    camera, inside = points @ pose[:3, :3].T + pose[:3, 3], view.sees(points)
+    safe = torch.where(inside, camera[:, 2], torch.ones_like(camera[:, 2]))
     image = (camera / safe[:, None]) @ K.T
-    inside = front & (image[:, 0] >= 0) & (image[:, 0] < view.width) & (image[:, 1] >= 0) & (image[:, 1] < view.height)
     image = torch.where(inside[:, None], image, torch.zeros_like(image))
     column, row = (image[:, 0] / stride).long(), (image[:, 1] / stride).long()
     layer = torch.floor(safe.double().log() / math.log1p(depth_step)).long() + (1 << 20)

@@ -62,7 +62,7 @@ class Frame(PointingFrame):
 
 
 def flags_for(channels: int) -> tuple[str, ...]:
-    """What NVRTC, or nvcc, is told to compile the kernels for so many colors."""
+    """What NVRTC is told to compile the kernels for so many colors."""
     return (*FLAGS, f"-DD2_CHANNELS={channels}", f"-DD2_FRAME_SIZE={ctypes.sizeof(Frame)}")
 
 

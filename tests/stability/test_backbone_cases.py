@@ -193,9 +193,11 @@ def test_case_33_a_gaussian_that_no_view_sees_is_not_judged(model: SplatModel, s
     d2 = D2Hooks(D2Config(prune=prune, views_per_evaluation=6), make_adapter(model), unlabelled(Label.VERIFIED))
     for view in make_views():
         d2.loss(1, view)
+    before = model.gaussians["base_colors"][:10].detach().clone()
     d2.step(2)
     assert len(model) < 60, "the others are judged: tau_p is zero"
     assert int((model.gaussians["positions"][:, 2] < -49).sum()) == (0 if sight else 10)
+    assert sight or torch.equal(model.gaussians["base_colors"][:10].detach(), before)
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, 0.0])

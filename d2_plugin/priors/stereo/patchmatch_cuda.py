@@ -47,7 +47,7 @@ class Call(ctypes.Structure):
 
 
 def flags_for(sources: int) -> tuple[str, ...]:
-    """Flags of NVRTC, or nvcc, to compile the kernels for so many sources of a view."""
+    """Flags of NVRTC to compile the kernels for so many sources of a view."""
     return (*FLAGS, f"-DD2_MAX_SOURCES={sources}", f"-DD2_CALL_SIZE={ctypes.sizeof(Call)}")
 
 
