@@ -17,13 +17,22 @@ from d2_plugin.hooks import HOOKS
 from d2_plugin.hooks.densify import DensifyConfig
 from d2_plugin.hooks.depth_loss import DepthLossConfig
 from d2_plugin.hooks.motion import MotionConfig
+from d2_plugin.hooks.parallax import ParallaxConfig
 from d2_plugin.hooks.prior import Belief
 from d2_plugin.hooks.prune import PruneConfig
 from d2_plugin.reading import NoSuchFile, read_toml
 from d2_plugin.settings import FORMAT, NONE, AtLeastOne, Count, Range, Seed, Settings, of_this_format
 from d2_plugin.values import checked_arguments
 
-__all__ = ["D2Config", "DensifyConfig", "DepthLossConfig", "MotionConfig", "PruneConfig", "for_iterations"]
+__all__ = [
+    "D2Config",
+    "DensifyConfig",
+    "DepthLossConfig",
+    "MotionConfig",
+    "ParallaxConfig",
+    "PruneConfig",
+    "for_iterations",
+]
 
 if TYPE_CHECKING:
     _HookTables: Any = Settings

@@ -26,7 +26,7 @@ OF_THE_RUN = (
     *("test_cameras", "backbone", "iterations", "hooks", "priors", "accept_empty_prior"),
     *("hold_out_instants", "background_weight", "seed", "device"),
 )
-TABLES = ("densify", "prune", "depth_loss", "motion", "d2", "priors", "backbone", "plan", "import")
+TABLES = ("densify", "prune", "depth_loss", "motion", "parallax", "d2", "priors", "backbone", "plan", "import")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -27,6 +27,7 @@ from d2_plugin.hooks.densify import Densify, DensifyConfig
 from d2_plugin.hooks.depth_loss import DepthLoss, DepthLossConfig
 from d2_plugin.hooks.hook import Context, Hook, HookConfig, Surveyed, Window
 from d2_plugin.hooks.motion import Motion, MotionConfig
+from d2_plugin.hooks.parallax import Parallax, ParallaxConfig
 from d2_plugin.hooks.prior import PriorLoader
 from d2_plugin.hooks.prune import Prune, PruneConfig
 
@@ -42,6 +43,8 @@ __all__ = [
     "HookRow",
     "Motion",
     "MotionConfig",
+    "Parallax",
+    "ParallaxConfig",
     "PriorLoader",
     "Prune",
     "PruneConfig",
@@ -64,5 +67,6 @@ HOOKS: dict[str, HookRow] = {
     "prune": HookRow(PruneConfig, Prune, edits_structure=True),
     "depth_loss": HookRow(DepthLossConfig, DepthLoss, edits_structure=False),
     "motion": HookRow(MotionConfig, Motion, edits_structure=False),
+    "parallax": HookRow(ParallaxConfig, Parallax, edits_structure=False),
 }
 """Hooks by name, in the order in which they run."""

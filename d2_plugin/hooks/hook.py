@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -12,9 +13,11 @@ from torch import Tensor
 
 from d2_plugin.hooks.expected import check_device, check_splats
 from d2_plugin.hooks.prior import PriorLoader
-from d2_plugin.protocol import Backbone, DepthPrior, Edit, Splats, Survey, View
-from d2_plugin.rasterizer import survey
+from d2_plugin.protocol import Backbone, DepthPrior, Edit, Splats, Survey, View, call_optional
+from d2_plugin.rasterizer import rasterize, survey
 from d2_plugin.settings import Every, Settings, Steps
+
+log = logging.getLogger(__name__)
 
 FREE_SIGMAS = 3.0
 """Space is known to be free up to D* less this many standard deviations."""
@@ -145,3 +148,36 @@ class Hook:
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
         """Continue from `state_dict()`."""
+
+
+class ImageHook(Hook):
+    """Base of hooks that compare what the backbone shows with an image of their own; their settings have a `weight`."""
+
+    def __init__(self, config: Any) -> None:
+        super().__init__(config)
+        self._colorless = False
+
+    def loss(self, context: Context) -> Tensor | None:
+        """The weight times the mean over the views of which something is known; None where there are none."""
+        if self.config.weight == 0 or self._colorless:
+            return None
+        known = [term for view in context.views if (term := self.term(context, view)) is not None]
+        return self.config.weight * torch.stack(known).mean() if known else None
+
+    def term(self, context: Context, view: View) -> Tensor | None:
+        """The loss of one view of the present step; None where nothing is known of it."""
+        raise NotImplementedError
+
+    def drawn(self, backbone: Backbone, view: View) -> tuple[Tensor, Tensor] | None:
+        """What the backbone shows, with gradients: RGB [H, W, 3], and the share [H, W, 1] that a background of its
+        own would have where it does not say which. None, and a warning, where it has no colours."""
+        splats = backbone.slice_at(view)
+        colors = call_optional(backbone, "colors", view, splats)
+        if colors is None:
+            name = type(self).__name__.lower()
+            log.warning("%s supervises nothing: the backbone has no `colors`, see d2_plugin.protocol.Backbone", name)
+            self._colorless = True
+            return None
+        render = rasterize(splats, colors, view, backbone.settings)
+        clear, whole = (1 - render.alpha)[..., None], call_optional(backbone, "behind", render, view)
+        return (render.color, clear) if whole is None else (whole.color, torch.zeros_like(clear))

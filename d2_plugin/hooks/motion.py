@@ -9,20 +9,15 @@ halfway.
 
 from __future__ import annotations
 
-import logging
 from dataclasses import dataclass
 from typing import Annotated
 
 import torch
 from torch import Tensor
 
-from d2_plugin.hooks.hook import Context, Hook, HookConfig
-from d2_plugin.hooks.prior import Kept
-from d2_plugin.protocol import Backbone, Label, View, call_optional
-from d2_plugin.rasterizer import rasterize
+from d2_plugin.hooks.hook import Context, HookConfig, ImageHook
+from d2_plugin.protocol import Label, View
 from d2_plugin.settings import Range, Share
-
-log = logging.getLogger(__name__)
 
 ORDER = (2, 1, 2, 3)
 """Quarters of the way in turn: halfway, farthest from what is trained, twice as often."""
@@ -40,39 +35,25 @@ class MotionConfig(HookConfig):
     """Whether `densify` also inserts what moves at instants halfway."""
 
 
-class Motion(Hook):
+class Motion(ImageHook):
     """Adds the photometric loss between each view of the present step and the same camera's next instant."""
 
     config: MotionConfig
 
-    def __init__(self, config: MotionConfig) -> None:
-        super().__init__(config)
-        self._colorless = False
-
-    def loss(self, context: Context) -> Tensor | None:
-        """The weight times the mean over the views after which something is known; None where there are none."""
-        if self.config.weight == 0 or self._colorless:
-            return None
-        quarter = ORDER[context.step // self.config.every % len(ORDER)]
-        pairs = [context.prior.underway(view, context.instants(view.camera), quarter) for view in context.views]
-        terms = [self._term(context.backbone, *pair) for pair in pairs if pair is not None]
-        known = [term for term in terms if term is not None]
-        return self.config.weight * torch.stack(known).mean() if known else None
-
-    def _term(self, backbone: Backbone, view: View, kept: Kept) -> Tensor | None:
+    def term(self, context: Context, view: View) -> Tensor | None:
+        """See `ImageHook.term`."""
         from d2_plugin.gaussians.photometric import photometric_loss  # a trainer without this hook needs none of it
 
-        splats = backbone.slice_at(view)
-        colors, prior = call_optional(backbone, "colors", view, splats), kept.maps.codes
-        if colors is None or prior.colors is None:
-            log.warning("motion supervises nothing: the backbone has no `colors`, see d2_plugin.protocol.Backbone")
-            self._colorless = True
+        quarter = ORDER[context.step // self.config.every % len(ORDER)]
+        pair = context.prior.underway(view, context.instants(view.camera), quarter)
+        if pair is None or pair[1].maps.codes.colors is None:
             return None
-        render = rasterize(splats, colors, view, backbone.settings)
+        between, prior = pair[0], pair[1].maps.codes
+        drawn = self.drawn(context.backbone, between)
+        if drawn is None:
+            return None
         shown, labels = (part.to(view.K.device, non_blocking=True) for part in (prior.colors, prior.labels))
-        image = shown.to(render.color) / 255
-        # A background that is not known shows what the image shows.
-        unknown = render._replace(color=render.color + (1 - render.alpha)[..., None] * image)
-        color = call_optional(backbone, "behind", render, view, default=unknown).color
+        image = shown.to(drawn[0]) / 255
+        color = drawn[0] + drawn[1] * image  # a background that is not known shows what the image shows
         moved = (labels != Label.CONFLICT)[..., None]
         return photometric_loss(color, torch.where(moved, image, color.detach()), self.config.ssim_weight)

@@ -58,8 +58,8 @@ class Scene:
         check_memory(recording, train)
         check_background_weight(recording, train, settings.background_weight)
         notes = (*recording.notes, *check_recording(recording, (*train, *test), scored=test))
-        if "motion" in {*settings.hooks} - {*hooks_in_use(settings)}:
-            notes += (f"a run of {settings.iterations} steps leaves `motion` out: a table [motion] brings it back",)
+        for name in sorted({*settings.hooks} - {*hooks_in_use(settings), "prior"}):
+            notes += (f"a run of {settings.iterations} steps leaves `{name}` out: a table [{name}] brings it back",)
         recording = replace(recording, notes=notes)
         priors, mono = prior_settings(settings), None
         if settings.mono_onnx:

@@ -30,6 +30,8 @@ from d2_plugin.values import shown
 
 HOOK_NAMES = ("prior", *HOOKS)
 """What `--hooks` may name; "prior" alone builds the depth prior and trains without it."""
+BETWEEN = ("motion", "parallax")
+"""Hooks that supervise between what was recorded; a third of the time of a step."""
 TABLES = ("backbone", "d2", *HOOKS, "priors", "plan")
 """What a configuration file may hold."""
 
@@ -155,8 +157,8 @@ def prior_settings(settings: RunSettings) -> PriorSettings:
 
 
 def hooks_in_use(settings: RunSettings) -> tuple[str, ...]:
-    """Names of the run's hooks. `motion` takes a quarter of the time: in so short a run more steps gain more."""
-    out = {"prior"} if settings.iterations >= 200 or "motion" in settings.overrides else {"prior", "motion"}
+    """Names of the run's hooks. A short run leaves `BETWEEN` out, unless they have a table: more steps gain more."""
+    out = {"prior"} if settings.iterations >= 200 else {"prior", *BETWEEN} - {*settings.overrides}
     return tuple(name for name in settings.hooks if name not in out)
 
 

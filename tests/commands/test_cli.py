@@ -56,7 +56,7 @@ def test_a_run_leaves_scores_images_configuration_and_checkpoint(finished: Path)
     assert metrics["test"]["lpips"] is None
     assert metrics["train_cameras"] == CAMERAS.split(",")
     assert metrics["test_cameras"] == ["test0"]
-    assert metrics["hooks"] == ["prior", "densify", "prune", "depth_loss", "motion"]
+    assert metrics["hooks"] == ["prior", "densify", "prune", "depth_loss", "motion", "parallax"]
     assert metrics["iterations"] == 40
     assert metrics["gaussians"] > 100
     assert set(metrics["seconds"]) == {"priors", "train", "eval"}

@@ -168,7 +168,7 @@ assert hook_config(run, Path("p")).shrink.weight == 2.0
 assert for_iterations(["shrink"], 100).hooks == ("shrink",)
 for wrong, sentence in (
     ({"shrink": {"weight": -1}}, "shrink.weight must be at least 0, got -1"),
-    ({"shrnk": {}}, "unknown hook 'shrnk': have densify, depth_loss, motion, prune, shrink; did you mean 'shrink'?"),
+    ({"shrnk": {}}, "unknown hook 'shrnk': have densify, depth_loss, motion, parallax, prune, shrink; did you mean 'shrink'?"),
 ):
     try:
         D2Config.from_dict(wrong)

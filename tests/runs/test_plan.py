@@ -77,7 +77,7 @@ def test_flow_is_built_where_the_run_is_long_enough_to_use_it_or_its_user_says_s
         str(save_recording(moving, tmp_path / "room")), PAIR, iterations=iterations, overrides=tables
     )
     run = Run(settings, tmp_path / "run")
-    assert any("brings it back" in note for note in run.scene.recording.notes) == (not built)
+    assert any("[motion] brings it back" in note for note in run.scene.recording.notes) == (not built)
     with pytest.raises(D2Error, match=f"between: {built}"):
         run.prepare()
 

@@ -54,6 +54,7 @@ PRESETS: dict[str, Preset] = {
         Preset("no_pruning", "w/o Pruning", _without("prune")),
         Preset("no_rgbd", "w/o RGB-D", _without("depth_loss")),
         Preset("no_motion", "w/o motion", _without("motion")),
+        Preset("no_parallax", "w/o parallax", _without("parallax")),
         Preset("motion_by_loss", "motion by the loss only", overrides={"motion": {"insert": False}}),
         Preset("motion_by_insertion", "motion at insertion only", overrides={"motion": {"weight": 0.0}}),
         Preset("full", "D²-4DGS"),
@@ -74,6 +75,7 @@ TABLES: dict[str, tuple[str, ...]] = {
         *("no_densification", "no_pruning", "no_rgbd", "full", "full_d2_densification_only"),
     ),
     "motion": ("no_motion", "motion_by_insertion", "motion_by_loss", "full"),
+    "parallax": ("no_parallax", "full"),
     "pruning": ("no_pruning", "opacity_only", "depth_only", "full"),
     "main": ("backbone", "full"),
 }
@@ -89,6 +91,7 @@ PUBLISHED: dict[str, tuple[str, dict[str, float]]] = {
             "full": 27.2302,
         },
     ),
+    "parallax": ("no_parallax", "full"),
     "pruning": (
         "tab:pruning_criteria: actor5_6 of ENeRF-Outdoor, 4 views",
         {"no_pruning": 21.1874, "opacity_only": 21.5663, "depth_only": 21.9076, "full": 22.2082},

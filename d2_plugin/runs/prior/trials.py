@@ -207,7 +207,7 @@ class _Trial:
 
     def _config(self) -> D2Config:
         """The run's hooks with schedules of a trial, which is too short to gather the evidence that pruning takes."""
-        config: Any = replace(cast(Any, hook_config(self.settings, Path())), prune=None)
+        config: Any = replace(cast(Any, hook_config(self.settings, Path())), prune=None, parallax=None)
         if config.densify is None:
             return config
         return replace(config, densify=replace(config.densify, every=STEPS // EVALUATIONS))

@@ -1,0 +1,234 @@
+"""Parallax: what two cameras know is seen on the way from one to the other, unless something known hides it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from test_motion import model_far_away
+from tiny import (
+    DISTANCE,
+    HEIGHT,
+    WIDTH,
+    TinyFrames,
+    TinyStore,
+    make_adapter,
+    make_model,
+    make_trainer,
+    make_views,
+    parameters,
+    same,
+)
+from torch import Tensor
+
+from d2_plugin.config import D2Config, ParallaxConfig
+from d2_plugin.hooks import parallax
+from d2_plugin.hooks.hook import Context
+from d2_plugin.hooks.parallax import Parallax, Side, in_sight, on_the_way
+from d2_plugin.hooks.prior import PriorLoader
+from d2_plugin.protocol import DepthPrior, Label, View
+
+LEFT, MIDDLE, RIGHT = make_views()[:3]
+"""The middle one is halfway between the others; from camera to camera the plane moves by four pixels."""
+STEP = 4
+KNOWN = WIDTH // 2
+"""Columns of each view that are verified."""
+
+
+def prior_of(view: View) -> DepthPrior:
+    prior = TinyStore().prior(view.camera, view.frame)
+    return prior._replace(depth=prior.depth.clone())
+
+
+def seen_columns(own: DepthPrior, other: DepthPrior, row: int = 0) -> list[int]:
+    """The columns of the left view that are seen halfway to the right one."""
+    pixels, _ = in_sight(MIDDLE, Side(LEFT, own), Side(RIGHT, other))
+    return [int(pixel) % WIDTH for pixel in pixels if int(pixel) // WIDTH == row]
+
+
+def context_of(adapter: object, views: list[View], store: object | None = None, step: int = 4) -> Context:
+    """Of a loss for the left view, once the given ones were trained on."""
+    loader = PriorLoader(store or TinyStore())
+    generator = torch.Generator().manual_seed(0)
+    return Context(step, adapter, [LEFT], loader, generator, beside=lambda view: views)
+
+
+def loss_of(adapter: object, views: list[View], store: object | None = None, **changes: float) -> Tensor | None:
+    return Parallax(ParallaxConfig(**changes)).loss(context_of(adapter, views, store))
+
+
+class NoBackground:
+    """An adapter whose trainer's background is not known."""
+
+    behind = None
+
+    def __init__(self, adapter: object) -> None:
+        self.adapter = adapter
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self.adapter, name)
+
+    def __len__(self) -> int:
+        return len(self.adapter)
+
+
+def turned(degrees: float, x: float) -> View:
+    """The left view at another place, turned about its vertical axis."""
+    c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+    pose = torch.eye(4)
+    pose[:3, :3] = torch.tensor([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+    pose[:3, 3] = -pose[:3, :3] @ torch.tensor([float(x), 0, 0])
+    return replace(LEFT, camera="turned", T_camera_world=pose)
+
+
+def test_the_way_leads_from_one_camera_to_the_other() -> None:
+    start, end = turned(0, -0.4), turned(90, 0.8)
+    for part, angle, x in ((0, 0, -0.4), (0.5, 45, 0.2), (1, 90, 0.8)):
+        torch.testing.assert_close(
+            on_the_way(start, end, part).T_camera_world, turned(angle, x).T_camera_world, atol=1e-6, rtol=0
+        )
+    assert on_the_way(LEFT, RIGHT, 0.5).camera == LEFT.camera  # its colours are those that this camera sees
+
+
+@pytest.mark.parametrize("degrees", [0, 90, 179.99, 180])
+def test_a_pose_on_the_way_is_a_rotation_however_far_apart_the_cameras_look(degrees: float) -> None:
+    rotation = on_the_way(turned(0, 0), turned(degrees, 0), 0.5).T_camera_world[:3, :3]
+    torch.testing.assert_close(rotation @ rotation.T, torch.eye(3), atol=1e-5, rtol=0)
+    assert torch.linalg.det(rotation) > 0
+
+
+def test_a_plane_that_both_know_is_seen_where_it_lies_from_there() -> None:
+    pixels, places = in_sight(MIDDLE, Side(LEFT, prior_of(LEFT)), Side(RIGHT, prior_of(RIGHT)))
+    columns, rows = pixels % WIDTH, pixels // WIDTH
+    # Of the 16 columns that the left camera knows, the right one sees those from the eighth on, eight further left.
+    assert columns.unique().tolist() == list(range(2 * STEP, KNOWN))
+    assert rows.unique().tolist() == list(range(HEIGHT))
+    torch.testing.assert_close(places, torch.stack([columns + 0.5 - STEP, rows + 0.5]), atol=1e-4, rtol=0)
+
+
+def test_mono_only_pixels_are_not_taken_for_known() -> None:
+    other = prior_of(RIGHT)
+    other.labels[:] = Label.MONO
+    assert not seen_columns(prior_of(LEFT), other)
+
+
+def test_what_either_camera_knows_to_stand_before_it_hides_it() -> None:
+    own, other = prior_of(LEFT), prior_of(RIGHT)
+    own.depth[0, 15] = DISTANCE / 2  # moves by eight pixels from camera to camera: column 7 of the middle view
+    assert seen_columns(own, other) == [8, 9, 13, 14]
+    other.depth[0, 0] = DISTANCE / 2  # before the plane's column 8, and in column 8 of the middle view, before its 12
+    assert seen_columns(prior_of(LEFT), other) == [9, 10, 14, 15]
+
+
+@pytest.mark.parametrize(("share", "seen"), [(1.0, True), (1.3, True), (1.8, False), (0.9, False)])
+def test_both_cameras_place_a_surface_within_a_pixel_or_so_of_each_other(share: float, seen: bool) -> None:
+    other = prior_of(RIGHT)._replace(depth=share * prior_of(RIGHT).depth)
+    assert bool(seen_columns(prior_of(LEFT), other)) == seen
+
+
+@pytest.mark.parametrize("size", [1e-4, 1.0, 1e6])
+@pytest.mark.parametrize("away", [0.0, 1e3])
+def test_the_size_of_the_world_and_its_origin_do_not_matter(size: float, away: float) -> None:
+    def moved(view: View) -> View:
+        pose = view.T_camera_world.clone()
+        pose[:3, 3] = size * (pose[:3, 3] - away)
+        return replace(view, T_camera_world=pose)
+
+    priors = [prior_of(view)._replace(depth=size * prior_of(view).depth) for view in (LEFT, RIGHT)]
+    aside = on_the_way(moved(LEFT), moved(RIGHT), 0.5)
+    pixels, places = in_sight(aside, Side(moved(LEFT), priors[0]), Side(moved(RIGHT), priors[1]))
+    expected, there = in_sight(MIDDLE, Side(LEFT, prior_of(LEFT)), Side(RIGHT, prior_of(RIGHT)))
+    common = torch.isin(pixels, expected)
+    assert common.sum() > 0.8 * len(expected)  # float32 may lose a column at the edge
+    torch.testing.assert_close(places[:, common], there[:, torch.isin(expected, pixels)], atol=0.02, rtol=0)
+
+
+def test_from_the_same_place_all_that_both_know_is_seen() -> None:
+    twin = replace(LEFT, camera="twin")
+    pixels, _ = in_sight(on_the_way(LEFT, twin, 0.5), Side(LEFT, prior_of(LEFT)), Side(twin, prior_of(LEFT)))
+    assert len(pixels) == HEIGHT * KNOWN
+
+
+def test_where_nothing_is_drawn_before_an_unknown_background_nothing_is_lost() -> None:
+    adapter = NoBackground(make_adapter(model_far_away()))
+    assert float(loss_of(adapter, [LEFT, RIGHT]).detach()) == pytest.approx(0, abs=1e-6)
+
+
+def test_what_floats_before_a_surface_gets_fainter() -> None:
+    model = make_model(count=1, background=False)
+    with torch.no_grad():
+        model.gaussians["positions"][:] = torch.tensor([[-0.4, 0.0, 1.5]])  # in no known pixel of the left view
+        model.gaussians["log_scales"].fill_(math.log(0.2))
+        model.gaussians["base_colors"].fill_(1.7)
+    loss = loss_of(NoBackground(make_adapter(model)), [LEFT, RIGHT])
+    loss.backward()
+    assert float(loss.detach()) > 0.01
+    assert model.gaussians["opacity_logits"].grad > 0
+
+
+def test_it_has_the_weight_that_was_asked_for() -> None:
+    adapter = make_adapter(make_model())
+    torch.testing.assert_close(loss_of(adapter, [LEFT, RIGHT], weight=2.0), 2 * loss_of(adapter, [LEFT, RIGHT]))
+    assert loss_of(adapter, [LEFT, RIGHT], weight=0.0) is None
+
+
+def test_all_other_cameras_come_in_turn() -> None:
+    adapter, hook = make_adapter(make_model()), Parallax(ParallaxConfig(every=1))
+    losses = {float(hook.loss(context_of(adapter, [LEFT, MIDDLE, RIGHT], step=step)).detach()) for step in range(8)}
+    assert len(losses) == 4  # two cameras at two places on the way
+
+
+def test_what_is_kept_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    trained = []
+    for kept in (parallax.KEPT, 0):
+        monkeypatch.setattr(parallax, "KEPT", kept)
+        trainer = make_trainer(D2Config(parallax=ParallaxConfig()), iterations=12)
+        trainer.run()
+        trained.append(parameters(trainer))
+    assert same(*trained)
+
+
+def test_a_resumed_run_is_bitwise_the_uninterrupted_one() -> None:
+    config = D2Config(parallax=ParallaxConfig())
+    whole, first, second = (make_trainer(config, iterations=12) for _ in range(3))
+    whole.run()
+    first.run(5)
+    second.load_state_dict(first.state_dict())
+    second.run()
+    assert same(parameters(whole), parameters(second))
+
+
+class Nothing(TinyStore):
+    """A store that knows nothing of the right camera."""
+
+    def prior(self, camera: str, frame: int) -> DepthPrior | None:
+        return None if camera == RIGHT.camera else super().prior(camera, frame)
+
+
+@pytest.mark.parametrize(
+    ("views", "store"),
+    [([LEFT], None), ([], None), ([LEFT, make_views()[5]], None), ([LEFT, RIGHT], Nothing())],
+    ids=["one camera", "cameras that move", "another instant", "no prior beside"],
+)
+def test_there_is_no_loss_where_nothing_is_known(views: list[View], store: object | None) -> None:
+    assert loss_of(make_adapter(make_model()), views, store) is None
+
+
+def test_a_backbone_without_colours_is_told_once(caplog: pytest.LogCaptureFixture) -> None:
+    adapter, hook = NoBackground(make_adapter(make_model())), Parallax(ParallaxConfig())
+    adapter.colors = None
+    for step in (2, 4):
+        assert hook.loss(context_of(adapter, [LEFT, RIGHT], step=step)) is None
+    assert [record.message for record in caplog.records if "parallax" in record.message] == [
+        "parallax supervises nothing: the backbone has no `colors`, see d2_plugin.protocol.Backbone"
+    ]
+
+
+def test_images_of_the_plane_agree_with_it() -> None:
+    """The image of the middle camera is what the left one's pixels show there."""
+    frames = TinyFrames()
+    pixels, places = in_sight(MIDDLE, Side(LEFT, prior_of(LEFT)), Side(RIGHT, prior_of(RIGHT)))
+    shown = parallax._sampled(frames.image(1), places)
+    torch.testing.assert_close(shown, frames.image(0).view(-1, 3)[pixels], atol=1e-4, rtol=0)
