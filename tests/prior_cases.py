@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.emulated_multiview import emulated_multiview
+from d2_plugin.priors.geometry import viewing_rays
 from d2_plugin.recordings.recording import Camera, Recording, Source
 
 Shown = Callable[[str, int], "np.ndarray | None"]
@@ -39,6 +40,15 @@ def camera_at(
     length = focal or size[0]
     K = np.array([[length, 0, principal[0] * size[0]], [0, length, principal[1] * size[1]], [0, 0, 1.0]])
     return Camera("camera", *size, K, T)
+
+
+def plane_seen_by(camera: Camera, normal: Sequence[float], offset: float) -> np.ndarray:
+    """Planar depth [H, W] of the plane normal . X = offset of the world, 0 where a ray does not meet it."""
+    R, t = camera.T_camera_world[:3, :3], camera.T_camera_world[:3, 3]
+    toward = viewing_rays(camera, np.float64) @ (R @ normal)
+    reached = offset + (R @ normal) @ t
+    met = toward * np.sign(reached) > 1e-3
+    return np.where(met, reached / np.where(met, toward, 1), 0)
 
 
 def contents(path: Path) -> dict[str, bytes]:

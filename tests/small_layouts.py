@@ -18,6 +18,9 @@ from d2_plugin.recordings.synthetic.room import synthetic_recording
 
 W, H = 48, 32
 
+CLOUD = PointCloud(np.eye(3) + 2, np.full((3, 3), 0.5), np.zeros(3))
+"""The points of a model of COLMAP's."""
+
 
 def small_recording() -> Recording:
     """Two cameras, two frames, true depth and monocular maps; it declares near and far."""
@@ -40,8 +43,7 @@ def write_layout(name: str, path: Path) -> Path:
         return _technicolor(recording, path)
     if name == "enerf":
         return _enerf(recording, path)
-    cloud = PointCloud(np.eye(3) + 2, np.full((3, 3), 0.5), np.zeros(3))
-    export_recording(recording, name.removesuffix("_text"), path, cloud=cloud)
+    export_recording(recording, name.removesuffix("_text"), path, cloud=CLOUD)
     if name == "colmap_text":
         model = path / "sparse" / "0"
         pytest.importorskip("pycolmap").Reconstruction(str(model)).write_text(str(model))

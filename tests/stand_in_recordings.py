@@ -13,6 +13,7 @@ from prior_cases import MAPS, showing
 from d2_plugin.errors import D2Error
 from d2_plugin.recordings import Recording, Source, open_recording
 from d2_plugin.recordings.export.n3dv import llff_row
+from d2_plugin.recordings.images import write_png
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 
 
@@ -66,6 +67,12 @@ def write_videos(recording: Recording, folder: Path) -> Path:
             video.write(recording.image(name, frame)[..., ::-1])
         video.release()
     return write_rows(recording, folder)
+
+
+def write_grey(path: Path, value: int = 0, size: tuple[int, int] = (32, 24)) -> None:
+    """An image of one grey value, `size` wide and high, and the folders that it lies in."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_png(path, np.full((size[1], size[0], 3), value, np.uint8))
 
 
 def write_rows(recording: Recording, folder: Path) -> Path:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import inspect
 import logging
 import math
 import random
@@ -14,11 +13,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from tiny import ALL_HOOKS, BACKBONES, TinyStore, make_adapter, make_model, make_trainer, make_views, parameters, same
+from tiny import ALL_HOOKS, BACKBONES, TinyStore, make_adapter, make_model, make_trainer, make_views
 
 from d2_plugin import D2Error, D2Hooks
 from d2_plugin.adapters.yang4d import Yang4DAdapter
-from d2_plugin.backbones import trainer as trainer_module
 from d2_plugin.backbones.trainer import Trainer
 from d2_plugin.config import D2Config, DensifyConfig, PruneConfig
 from d2_plugin.hooks.edits import faintest
@@ -30,33 +28,6 @@ from d2_plugin.rasterizer import rasterize
 
 def only(*hooks: str) -> D2Config:
     return replace(ALL_HOOKS, **{name: None for name in ALL_HOOKS.hooks if name not in hooks})
-
-
-def trainer_without(*numbers: int) -> type[Trainer]:
-    """The bundled trainer with some of the three lines that attach D2 taken out of its source."""
-    lines = inspect.getsource(Trainer).splitlines()
-    for number in numbers:
-        (index,) = (i for i, line in enumerate(lines) if f"# D2, line {number}" in line)
-        guarded = lines[index - 1].strip() == "if d2 is not None:"
-        del lines[index - 1 if guarded else index : index + 1]
-    space = dict(vars(trainer_module))
-    exec("\n".join(lines), space)
-    space["Trainer"].d2 = None
-    return space["Trainer"]
-
-
-def test_a_trainer_changes_by_three_lines_and_each_does_its_part() -> None:
-    assert inspect.getsource(Trainer).count("# D2, line") == 3
-    bare, without = make_trainer(None, 16), make_trainer(ALL_HOOKS, 16, kind=trainer_without(1, 2, 3))
-    bare.run()
-    without.run()
-    assert same(parameters(bare), parameters(without)), "a fourth line attaches D2"
-    done = {}
-    for missing in (None, 2, 3):
-        trainer = make_trainer(ALL_HOOKS, 16, kind=trainer_without(missing) if missing else Trainer)
-        trainer.run()
-        done[missing] = {entry.action for entry in trainer.d2.trace}
-    assert done == {None: {"loss", "insert", "remove"}, 2: set(), 3: {"loss"}}  # line 2 shows the views to survey
 
 
 def random_states() -> list[object]:
@@ -148,13 +119,6 @@ def test_a_prior_of_another_size_is_refused_with_both_values() -> None:
     d2 = D2Hooks(only("depth_loss"), Yang4DAdapter(make_model()), TinyStore())
     with pytest.raises(D2Error, match="is 32x24 pixels but the view is 64x24"):
         d2.loss(1, view)
-
-
-def test_the_state_of_other_hooks_is_refused() -> None:
-    state = D2Hooks(only("prune"), Yang4DAdapter(make_model()), TinyStore()).state_dict()
-    other = D2Hooks(only("densify"), Yang4DAdapter(make_model()), TinyStore())
-    with pytest.raises(D2Error, match=r"made with hooks \['prune'\] but this run has \['densify'\]"):
-        other.load_state_dict(state)
 
 
 class TestRetirement:
@@ -296,10 +260,12 @@ def test_it_can_be_switched_off() -> None:
 
 @pytest.mark.parametrize("backbone", BACKBONES)
 def test_every_tensor_that_is_trained_is_checked(backbone: str) -> None:
-    model = make_model(backbone=backbone)
-    check = FiniteCheck(make_adapter(model), 1)
+    model = make_model(backbone=backbone, background=True)
+    check, trained = FiniteCheck(make_adapter(model), 1), make_adapter(model).trained()
+    assert {"positions", "background.constant", "background.harmonics"} <= set(trained)
+    assert any(name.startswith("field") for name in trained) is (backbone == "deform")
     check.check(1, now=False)
-    for name, value in make_adapter(model).trained().items():
+    for name, value in trained.items():
         kept = value.detach().clone()
         value.data.view(-1)[-1] = math.inf
         with pytest.raises(Diverged, match=name.replace(".", r"\.")):

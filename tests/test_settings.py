@@ -22,14 +22,9 @@ from tiny import ALL_HOOKS
 import d2_plugin
 from d2_plugin import D2Config
 from d2_plugin.backbones import deform
-from d2_plugin.backbones.deform import DeformSettings
-from d2_plugin.backbones.trainer import TrainSettings
-from d2_plugin.backbones.yang4d import Yang4DSettings
 from d2_plugin.config import DensifyConfig, PruneConfig
 from d2_plugin.errors import D2Error
-from d2_plugin.hooks import HOOKS
 from d2_plugin.priors.settings import PriorSettings
-from d2_plugin.protocol import RasterSettings
 from d2_plugin.runs.settings import RunSettings, check
 from d2_plugin.settings import (
     AtLeastOne,
@@ -224,14 +219,6 @@ def test_every_number_among_the_settings_is_one_and_has_both_bounds_and_every_de
             assert kind.from_dict(plain) == kind()
 
 
-@pytest.mark.parametrize(
-    "kind",
-    [D2Config, TrainSettings, Yang4DSettings, DeformSettings, RasterSettings, *(row.config for row in HOOKS.values())],
-)
-def test_every_setting_of_hooks_and_backbones_has_help(kind: type[Settings]) -> None:
-    assert [setting.name for setting in declared(kind) if not setting.help] == []
-
-
 RUN = RunSettings("room", ("a",))
 
 
@@ -248,8 +235,6 @@ def run(table: dict[str, Any]) -> RunSettings:
         (deform.settings_from, {"hexplane": {"resolutions": [1] * 9}}, r"resolutions has 9 levels: give one to eight"),
         (PriorSettings.from_dict, {"depth_range": [9.0, 1.0]}, "0 < near < far"),
         (PriorSettings.from_dict, {"stereo": {"min_angle": 60.0}}, "min_angle must be below max_angle, got 60 and 60"),
-        (run, {"mono_onnx": "net.onnx"}, r"--mono-onnx needs --mono-kind"),
-        (run, {"hooks": ("prun",)}, r"unknown hook 'prun'.*did you mean 'prune'"),
         (run, {"overrides": {"plan": {"temporl": True}}}, r"unknown decision of plan 'temporl'.*did you mean 'tempor"),
         (run, {"overrides": {"d2": {"densify": 5}}}, r"d2\.densify is a table of its own"),
         (run, {"overrides": {"prunes": {}}}, r"unknown table 'prunes'.*did you mean 'prune'"),

@@ -14,7 +14,6 @@ from rasterizer_arguments import inria_camera
 from splat_scenes import random_scene
 
 from d2_plugin.compat import ex4dgs, kinematic, nearest, spacetime, vision
-from d2_plugin.compat.nearest import knn
 from d2_plugin.compat.python_config import Config
 from d2_plugin.gaussians.rotation4d import rotation_matrices_3d
 from d2_plugin.protocol import RasterSettings, Splats
@@ -122,14 +121,6 @@ class TestPackages:
         assert config.A.y.z == 2
         assert config.B == 3
 
-    def test_nearest_points_are_those_of_all_distances(self) -> None:
-        points = torch.rand(1, 50, 3, generator=torch.Generator().manual_seed(0))
-        nearest_ones = knn(2, points, points, False)
-        distances = torch.cdist(points[0], points[0])
-        assert nearest_ones.shape == (1, 2, 50)
-        assert torch.equal(nearest_ones[0, 0].long(), torch.arange(50))
-        assert torch.equal(nearest_ones[0, 1].long(), distances.fill_diagonal_(9).argmin(1))
-
 
 class TestKinematic:
     """What cem-4dgs calls of pytorch3d and of faiss on a GPU."""
@@ -150,16 +141,21 @@ class TestKinematic:
         one = kinematic.quaternion_apply(a[:1], points)  # for many points
         torch.testing.assert_close(one, kinematic.quaternion_apply(a[:1].expand(50, 4), points))
 
-    def test_the_nearest_point_is_found(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(nearest, "PAIRS", 100)  # in several parts
-        points, queries = (self.rotations(seed)[:, :3].float().numpy() for seed in (4, 5))
-        index = nearest.GpuIndexFlatL2(nearest.StandardGpuResources(), 3)
-        index.add(points[:20])
-        index.add(points[20:])
-        distances, nearest_ones = index.search(queries, 1)
-        squared = ((queries[:, None] - points[None]) ** 2).sum(-1)
-        assert np.array_equal(nearest_ones[:, 0], squared.argmin(1))
-        np.testing.assert_allclose(distances[:, 0], squared.min(1), rtol=1e-4)
+
+def test_nearest_points_are_those_of_all_distances(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By pytorch3d's knn and by faiss on a GPU."""
+    monkeypatch.setattr(nearest, "PAIRS", 100)  # in several parts
+    points, queries = torch.rand(2, 50, 3, generator=torch.Generator().manual_seed(0))
+    distances = torch.cdist(queries, points)
+    index = nearest.GpuIndexFlatL2(nearest.StandardGpuResources(), 3)
+    index.add(points[:20].numpy())
+    index.add(points[20:].numpy())
+    squared, found = index.search(queries.numpy(), 1)
+    assert np.array_equal(found[:, 0], distances.argmin(1))
+    np.testing.assert_allclose(squared[:, 0], distances.amin(1).square(), rtol=1e-4)
+    own, other = nearest.knn(2, points[None], points[None], False)[0].long()
+    assert torch.equal(own, torch.arange(50))
+    assert torch.equal(other, torch.cdist(points, points).fill_diagonal_(9).argmin(1))
 
 
 def test_a_repositorys_own_lpips_is_not_a_number() -> None:

@@ -20,20 +20,7 @@ DEPTH_ALONE = D2Config(depth_loss=DepthLossConfig(every=1))
 
 
 class TestProbe:
-    def test_fudans_own_render_is_used_and_equals_ours(self, caplog: pytest.LogCaptureFixture) -> None:
-        model, scene = fudan_model()
-        adapter = FudanAdapter(model, scene)
-        d2 = D2Hooks(DEPTH_ALONE, adapter, TinyStore())
-        camera = scene.train_cameras[1.0][1]
-        with caplog.at_level(logging.INFO, logger="d2_plugin.adapters.inria"):
-            reused = d2.loss(1, adapter.rendered(camera, fudan.render(camera, model, [0, 0, 0])))
-        assert "the trainer's own render has depth and alpha with gradients" in caplog.text
-        assert adapter.probe.usable
-        torch.testing.assert_close(reused, d2.loss(2, camera))
-        reused.backward()
-        assert model._xyz.grad.any()
-
-    def test_a_batch_of_renders_is_found_view_by_view(
+    def test_fudans_own_renders_of_a_batch_are_used_view_by_view_and_equal_ours(
         self, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         model, scene = fudan_model()
@@ -44,8 +31,13 @@ class TestProbe:
         batch = [adapter.rendered(camera, fudan.render(camera, model, [0, 0, 0])) for camera in cameras]
         monkeypatch.setattr("d2_plugin.hooks.depth_loss.rasterize", None)  # D2 need not render
         with caplog.at_level(logging.INFO, logger="d2_plugin.adapters.inria"):
-            torch.testing.assert_close(d2.loss(2, batch), expected)
+            reused = d2.loss(2, batch)
+        torch.testing.assert_close(reused, expected)
+        assert "the trainer's own render has depth and alpha with gradients" in caplog.text
         assert "no render of the trainer" not in caplog.text
+        assert adapter.probe.usable
+        reused.backward()
+        assert model._xyz.grad.any()
 
     def test_a_render_of_an_earlier_step_is_not_used(self) -> None:
         model, scene = fudan_model()

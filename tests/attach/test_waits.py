@@ -14,6 +14,7 @@ from hooks.test_motion import Halfway
 from repositories import VARIANTS
 from tiny import HEIGHT, WIDTH
 from torch import Tensor
+from torch.utils._python_dispatch import _disable_current_modes
 
 from d2_plugin import D2Hooks
 from d2_plugin.config import D2Config, DepthLossConfig, MotionConfig
@@ -33,7 +34,9 @@ SMALL = 512
 
 def on_the_gpu(name: str) -> tuple[object, list[object]]:
     """The adapter of a mimic, and one of its cameras at both instants."""
-    standing, moved = VARIANTS[name](), {}
+    moved: dict[int, object] = {}
+    with _disable_current_modes():  # what stands on the host need not be counted
+        standing = VARIANTS[name]()
     items = name == "gsplat_dynamic"  # a data set's items stay on the host
     chosen = standing.cameras[:: len(standing.cameras) // 2]
     return move(standing.adapter, moved), [camera if items else move(camera, moved) for camera in chosen]
@@ -108,7 +111,7 @@ def test_what_waits_is_counted_and_nothing_else(fake_gpu: FakeGpu) -> None:  # n
         there[there > 1] = 0.0  # filled where the mask is
         torch.linalg.inv_ex(there[:3])
         assert not fake_gpu.waits
-        assert fake_gpu.copied == {"to device": 48, "largest": 48}
+        assert fake_gpu.copied == {"to device": 48}
     ways = {
         "_local_scalar_dense": lambda: float(there.sum()),
         "equal": lambda: torch.equal(there, there),

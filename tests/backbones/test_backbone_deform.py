@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
@@ -22,10 +21,6 @@ from d2_plugin.backbones.deform_fields import (
 from d2_plugin.backbones.densify import grow
 from d2_plugin.gaussians.slicing import MARGINAL_CUT, slice_gaussians
 from d2_plugin.protocol import Points
-from d2_plugin.recordings.export.folder import save_recording
-from d2_plugin.recordings.synthetic.room import synthetic_recording
-from d2_plugin.runs.run import Run
-from d2_plugin.runs.settings import RunSettings
 
 
 def deforming() -> Deform:
@@ -115,19 +110,6 @@ class TestModel:
         assert (((positions[1:] - box.centre) / box.reach).abs() <= 1.05).all()
         assert torch.isfinite(Box.around(torch.zeros(0, 3), 2.0).reach).all()
         assert (Box.around(torch.ones(1, 3), 2.0).reach > 0).all()
-
-
-def test_d2_train_runs_and_scores_it(tmp_path: Path) -> None:
-    pytest.importorskip("pycolmap", reason="pycolmap is in the `stereo` extra")
-    pytest.importorskip("cv2", reason="opencv is in the `image` extra")
-    recording = synthetic_recording(cameras=2, held_out=1, frames=2, width=64, height=36)
-    folder = str(save_recording(recording, tmp_path / "room"))
-    # images this small have no stereo
-    settings = RunSettings(folder, ("train0", "train1"), backbone="deform", iterations=24, accept_empty_prior=True)
-    Run(settings, tmp_path / "run").train()
-    metrics = Run.load(tmp_path / "run").evaluate(images=False)
-    assert metrics["backbone"] == "deform"
-    assert metrics["test"]["psnr"] > 8
 
 
 def make_field(seed: int = 0) -> HexPlaneField:

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import torch
 from at_once import measured_at_once
-from fuzzing import leaves
 from numpy.lib.stride_tricks import sliding_window_view
 from tiny import BACKBONES, TinyStore, make_adapter, make_model, make_views
 from torch import Tensor
@@ -227,20 +226,6 @@ class TestOnARecording:
         assert len(points) + 300 < len(started) <= len(points) + 0.18 * 96 * 54 + 6  # each of four images rounds
         np.testing.assert_array_equal(started.positions[: len(points)], points.positions)
         assert set(started.times) == {0.0, run.scene.recording.seconds(1)}
-
-    def test_a_resumed_rival_is_bitwise_the_uninterrupted_one(self, ablation: Path, tmp_path: Path) -> None:
-        """patch_norm draws at random: its draws come from the run's own generator, which is saved."""
-        whole, begun = folder_of(ablation, "patch_norm"), run_of(ablation, "patch_norm")
-        settings, rival = begun.settings, begun.guidance
-        run = Run(settings, tmp_path / "cut", rival)
-        (tmp_path / "cut" / "points.npz").write_bytes((whole / "points.npz").read_bytes())
-        trainer = run._trainer(run.prepare())
-        trainer.run(10)
-        run._save(trainer)
-        again = Run(settings, tmp_path / "cut", rival)
-        again.train()
-        ours, theirs = (torch.load(f / "checkpoint.pt", weights_only=True) for f in (tmp_path / "cut", whole))
-        assert leaves(ours["model"]) == leaves(theirs["model"])
 
 
 class TestAtTheirBest:

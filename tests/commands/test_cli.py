@@ -6,11 +6,9 @@ import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from oracles.export_files import ReadPage
 from prior_cases import contents
 
@@ -19,7 +17,6 @@ from d2_plugin.recordings import open_recording
 from d2_plugin.recordings.export import folder as folder_layout
 from d2_plugin.recordings.export.folder import save_recording
 from d2_plugin.recordings.synthetic.room import synthetic_recording
-from d2_plugin.runs.run import Run
 from d2_plugin.store.store import PriorStore
 from d2_plugin.viewing import demo
 
@@ -66,33 +63,6 @@ def test_a_run_leaves_scores_images_configuration_and_checkpoint(finished: Path)
     assert len(list((finished / "images").glob("test0_*.png"))) == 2
     assert (finished / "d2.toml").is_file()
     assert (finished / "checkpoint.pt").is_file()
-
-
-def test_a_cut_off_run_continues_to_the_same_score(
-    recording: Path, finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    class CutOff(BaseException):  # what ends the process; an Exception is a sentence
-        pass
-
-    output = tmp_path / "again"
-    save, steps = Run._save, list[int]()
-
-    def cut_off(run: Run, trainer: Any) -> None:
-        save(run, trainer)
-        steps.append(trainer.step)
-        if trainer.step == 24:
-            raise CutOff
-
-    with monkeypatch.context() as patch:
-        patch.setattr(Run, "_save", cut_off)
-        with pytest.raises(CutOff):
-            train(recording, output)
-        steps.clear()
-        assert train(recording, output) == 0
-    assert steps == [28, 32, 36, 40], "it goes on from where it was cut off"
-    ends = [torch.load(folder / "checkpoint.pt", weights_only=True)["model"] for folder in (finished, output)]
-    for name, value in ends[0]["parameters"].items():
-        assert torch.equal(value, ends[1]["parameters"][name]), name
 
 
 def test_evaluating_again_gives_the_same_scores(finished: Path) -> None:

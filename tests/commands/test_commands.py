@@ -48,13 +48,14 @@ class TestHelp:
             assert len(line.split()) > 5
 
     @pytest.mark.parametrize("command", [name for name in COMMANDS if name != "bench"])
-    def test_every_command_explains_each_of_its_settings(
+    def test_every_command_explains_each_of_its_settings_and_those_of_its_tables(
         self, command: str, capsys: pytest.CaptureFixture[str]
     ) -> None:
         assert main([command, "--help"]) == 0
         assert capsys.readouterr().out.startswith(f"usage: d2 {command}")
-        for setting in form_of(command, []).settings:
-            assert setting.help, f"{command}: {setting.name} has no docstring"
+        form = form_of(command, [])
+        for settings in (form.settings, *(section.settings for section in form.sections([]).values())):
+            assert not [setting.name for setting in settings if not setting.help], f"{command}: no docstring"
 
     def test_train_shows_tables_with_a_line_each_and_one_on_demand(self, capsys: pytest.CaptureFixture[str]) -> None:
         assert main(["train", "--help"]) == 0

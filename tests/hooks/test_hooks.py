@@ -135,6 +135,7 @@ from d2_plugin.settings import NotNegative
 """
 
 SCRIPT = """
+import no_dynamo
 from d2_plugin import hooks
 import shrink
 from shrink import Shrink, ShrinkConfig
@@ -142,7 +143,7 @@ HookRow = hooks.HookRow
 hooks.HOOKS |= {ROW}
 
 import torch
-from d2_plugin import D2Config, D2Error
+from d2_plugin import D2Config
 from d2_plugin.config import for_iterations
 from d2_plugin.runs.settings import HOOK_NAMES, RunSettings, check, hook_config
 from d2_plugin.settings import declared
@@ -166,16 +167,6 @@ assert "shrink" in HOOK_NAMES
 run = check(RunSettings("room", ("a",), hooks=("shrink",), overrides={"shrink": {"weight": 2}}))
 assert hook_config(run, Path("p")).shrink.weight == 2.0
 assert for_iterations(["shrink"], 100).hooks == ("shrink",)
-for wrong, sentence in (
-    ({"shrink": {"weight": -1}}, "shrink.weight must be at least 0, got -1"),
-    ({"shrnk": {}}, "unknown hook 'shrnk': have densify, depth_loss, motion, parallax, prune, shrink; did you mean 'shrink'?"),
-):
-    try:
-        D2Config.from_dict(wrong)
-    except D2Error as error:
-        assert sentence in str(error), error
-    else:
-        raise AssertionError(wrong)
 """
 
 

@@ -214,18 +214,6 @@ def test_the_sums_are_those_of_the_two_kinds_of_evidence() -> None:
     torch.testing.assert_close(found[1], total, rtol=1e-6, atol=1e-9)
 
 
-def test_streaks_of_free_space_follow_their_gaussians_and_are_saved() -> None:
-    hook, resumed = Prune(PruneConfig(patience=3, light=1)), Prune(PruneConfig(patience=3, light=1))
-    for _ in range(2):
-        removed(hook, bands())
-    streaks = [2 * (name in FLOATING) for name in CAST]
-    assert hook.streak.tolist() == streaks
-    resumed.load_state_dict(hook.state_dict())
-    assert removed(resumed, bands()) == removed(hook, bands()) == FLOATING
-    hook.follow(torch.tensor([1, -1, 0]))
-    assert hook.streak.tolist() == [3, 0, 0]
-
-
 def test_far_pixels_alone_reach_the_hook_through_the_plugin() -> None:
     """A prior of sky alone removes translucent Gaussians before it, through D2Hooks and a real backbone."""
     everywhere = torch.full((HEIGHT, WIDTH), int(Label.FAR), dtype=torch.uint8)

@@ -35,7 +35,7 @@ from d2_plugin.priors.fuse import FusedPrior
 from d2_plugin.priors.geometry import ViewPair, view_pair
 from d2_plugin.protocol import Label
 from d2_plugin.recordings.recording import Camera
-from oracles.surface import interpolated_surface
+from oracles.stereo_filter import interpolated_surface
 
 
 def with_evidence(

@@ -404,8 +404,6 @@ def test_a_build_that_stopped_within_a_block_goes_on_to_the_same_store(
     assert contents(tmp_path / "priors") == contents(still_built / "priors")
 
 
-SHARED = replace(REUSE, stereo=replace(REUSE.stereo, reuse_block=2))
-
 needs_dask = pytest.mark.skipif(
     importlib.util.find_spec("distributed") is None, reason="dask.distributed is not installed"
 )
@@ -424,9 +422,8 @@ def cluster() -> Iterator[object]:
 
 @needs_dask
 def test_a_worker_killed_in_the_middle_changes_no_byte_of_the_store(
-    still: Recording, cluster: object, tmp_path: Path
+    still: Recording, still_built: Path, cluster: object, tmp_path: Path
 ) -> None:
-    alone = build_priors(still, STILL_NAMES, tmp_path / "alone", SHARED)
     (worker,), killed, seen = cluster.workers.values(), [], []
 
     def kill(done: int, total: int, note: str) -> None:
@@ -436,14 +433,16 @@ def test_a_worker_killed_in_the_middle_changes_no_byte_of_the_store(
             os.kill(worker.pid, signal.SIGKILL)
 
     summary = build_priors_on_cluster(
-        still, STILL_NAMES, tmp_path / "p", SHARED, scheduler=cluster.scheduler_address, progress=kill
+        still, STILL_NAMES, tmp_path / "p", REUSE, scheduler=cluster.scheduler_address, progress=kill
     )
     assert worker.pid not in killed
     assert seen[0][0] < 10
     assert seen[-1] == (10, 10)
-    assert contents(tmp_path / "p") == contents(tmp_path / "alone")
+    assert contents(tmp_path / "p") == contents(still_built)
     assert summary.built + summary.kept == 10
-    assert summary.kept <= 2 * SHARED.stereo.reuse_block  # of the part that was begun twice
+    assert summary.kept <= 2 * REUSE.stereo.reuse_block  # of the part that was begun twice
+    alone = build_priors(still, STILL_NAMES, still_built, REUSE)
+    assert alone.kept == 10
     for camera in STILL_NAMES:
         assert summary.shares[camera] == pytest.approx(alone.shares[camera])
 
@@ -453,16 +452,16 @@ def test_what_a_single_build_refuses_the_cluster_refuses_in_the_same_words(
     still: Recording, cluster: object, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with pytest.raises(D2Error, match="unknown camera 'train7'.*did you mean"):
-        build_priors_on_cluster(still, ["train7"], tmp_path / "p", SHARED, scheduler=cluster.scheduler_address)
+        build_priors_on_cluster(still, ["train7"], tmp_path / "p", REUSE, scheduler=cluster.scheduler_address)
     client = importlib.import_module("distributed").Client
     monkeypatch.setattr("distributed.Client", lambda at, timeout, **more: client(at, timeout="0.2s", **more))
     with pytest.raises(D2Error, match="no dask scheduler answers at tcp://127.0.0.1:1 "):
-        build_priors_on_cluster(still, STILL_NAMES, tmp_path / "p", SHARED, scheduler="tcp://127.0.0.1:1")
+        build_priors_on_cluster(still, STILL_NAMES, tmp_path / "p", REUSE, scheduler="tcp://127.0.0.1:1")
     with pytest.raises(D2Error, match="give at least 1"):
-        build_priors_on_cluster(still, STILL_NAMES, tmp_path / "p", SHARED, workers=0)
+        build_priors_on_cluster(still, STILL_NAMES, tmp_path / "p", REUSE, workers=0)
 
 
 def test_without_dask_its_extra_is_named(still: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(MissingExtra, match=r"dask.distributed, which is not installed: .*d2-4dgs\[cluster\]"):
-        build_priors_on_cluster(still, STILL_NAMES, tmp_path / "p", SHARED)
+        build_priors_on_cluster(still, STILL_NAMES, tmp_path / "p", REUSE)

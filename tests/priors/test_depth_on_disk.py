@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from prior_cases import showing, write_dense_array
+from prior_cases import plane_seen_by, showing, write_dense_array
 
 from d2_plugin.errors import D2Error
 from d2_plugin.priors import depth_on_disk
@@ -141,12 +141,6 @@ def test_what_a_stored_number_means_must_be_declared(recording: Recording, descr
         find_depth_on_disk(recording, NAMES, SENSOR)
 
 
-def test_sensors_are_taken_unasked_only_where_every_camera_has_one(recording: Recording) -> None:
-    write_sensor(recording, {"unit": "mm"})
-    assert find_depth_on_disk(recording, NAMES, AUTO) is None
-    assert find_depth_on_disk(recording, NAMES[:2], AUTO).name == "sensor"
-
-
 def test_a_map_that_is_no_depth_is_named(recording: Recording) -> None:
     folder = write_sensor(recording, {"unit": "mm"})
     camera, sensor = recording.cameras["train0"], SensorDepth(folder, NAMES)
@@ -200,7 +194,7 @@ def test_one_camera_with_a_depth_sensor_has_a_verified_prior(recording: Recordin
     assert record["bounds"] is None
 
 
-def test_depth_on_disk_is_read_again_where_it_changed_and_only_there(
+def test_depth_on_disk_is_read_again_where_it_or_its_confidence_changed_and_only_there(
     recording: Recording, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder, settings = write_sensor(recording, {"unit": "mm"}), PriorSettings(stereo=SENSOR)
@@ -212,6 +206,9 @@ def test_depth_on_disk_is_read_again_where_it_changed_and_only_there(
     assert cv2.imwrite(str(folder / "train0" / "00001.png"), np.full((90, 160), 3000, np.uint16))
     assert build_priors(recording, NAMES, recording.path / "priors", settings).built == 3
     assert len(filtered) == len(NAMES), "one frame"
+    write_confidence(recording, np.full((90, 160), 0.5))
+    assert build_priors(recording, NAMES, recording.path / "priors", settings).built == 3
+    assert build_priors(recording, NAMES, recording.path / "priors", settings).built == 0
 
 
 def test_the_depth_range_of_the_settings_bounds_depth_on_disk_too(recording: Recording) -> None:
@@ -222,14 +219,6 @@ def test_the_depth_range_of_the_settings_bounds_depth_on_disk_too(recording: Rec
     assert depth[depth > 0].min() >= 0.999 * middle
     with pytest.raises(D2Error, match="swap or correct"):
         build_priors(recording, NAMES[:1], recording.path / "q", PriorSettings(depth_range=(9.0, 1.0)))
-
-
-@pytest.mark.parametrize("scale", [1.0, 37.5])
-def test_a_workspace_in_another_unit_comes_back_in_ours(recording: Recording, scale: float) -> None:
-    write_maps(recording, "colmap/00001", 1, scale)
-    depth = workspace(recording).depth(recording.cameras["train2"], 1)
-    np.testing.assert_allclose(depth, recording.depth("train2", 1), rtol=1e-5)
-    assert workspace(recording).depth(recording.cameras["train2"], 0) is None
 
 
 def test_a_workspace_is_found_where_it_usually_lies_or_where_the_settings_say(recording: Recording) -> None:
@@ -282,15 +271,12 @@ def test_maps_of_the_geometric_pass_come_first(still: Recording) -> None:
 
 
 def test_a_map_of_another_size_and_lens_is_looked_up_ray_by_ray(recording: Recording) -> None:
-    def tilted(height: int, width: int, K: np.ndarray) -> np.ndarray:
-        v, u = np.mgrid[:height, :width] + 0.5
-        return 4 / (1 + 0.2 * (u - K[0, 2]) / K[0, 0] + 0.1 * (v - K[1, 2]) / K[1, 1])
-
-    camera, wide = recording.cameras["train0"], pinhole(150.0, 155.0, 210.0, 120.0)
-    found = seen_by(camera, tilted(250, 400, wide), wide)
+    camera = replace(recording.cameras["train0"], T_camera_world=np.eye(4))
+    wide = replace(camera, width=400, height=250, K=pinhole(150.0, 155.0, 210.0, 120.0))
+    found = seen_by(camera, plane_seen_by(wide, (0.2, 0.1, 1), 4), wide.K)
     inside = found > 0
     assert inside.mean() > 0.9
-    expected = tilted(90, 160, camera.K)[inside]
+    expected = plane_seen_by(camera, (0.2, 0.1, 1), 4)[inside]
     np.testing.assert_allclose(found[inside], expected, rtol=0.005)  # half a pixel of the map's slope
 
 
@@ -428,15 +414,6 @@ def test_a_sensor_is_as_sure_as_it_says_and_a_pixel_it_does_not_trust_is_no_dept
     np.testing.assert_allclose(after.depth.numpy()[both], before.depth.numpy()[both], rtol=1e-3)
     expected = before.sigma.numpy()[both] / sure[both]
     np.testing.assert_allclose(after.sigma.numpy()[both], expected, rtol=0.05)
-
-
-def test_a_confidence_that_changes_builds_the_prior_anew_and_one_that_does_not_does_not(one_sensor: Recording) -> None:
-    write_confidence(one_sensor, np.ones((54, 96)))
-    settings = PriorSettings(stereo=SENSOR)
-    assert build_priors(one_sensor, [ONE], one_sensor.path / "store", settings).built == 1
-    assert build_priors(one_sensor, [ONE], one_sensor.path / "store", settings).built == 0
-    write_confidence(one_sensor, np.full((54, 96), 0.5))
-    assert build_priors(one_sensor, [ONE], one_sensor.path / "store", settings).built == 1
 
 
 @pytest.mark.parametrize("wrong", [-0.1, 1.5, np.nan])

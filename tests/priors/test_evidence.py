@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from prior_cases import camera_at
+from prior_cases import camera_at, plane_seen_by
 
 from d2_plugin.priors.build import build_priors
 from d2_plugin.priors.cross_view.kernel import BESIDE, LIKE, NEAR, WITHIN
@@ -15,7 +15,6 @@ from d2_plugin.priors.evidence import AGREED, ALONE, AT_BEST, with_evidence
 from d2_plugin.priors.fuse import FusedPrior
 from d2_plugin.priors.settings import PriorSettings
 from d2_plugin.protocol import Label
-from d2_plugin.recordings.recording import Camera
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.store.store import PriorStore
 
@@ -28,11 +27,9 @@ TOLERANCE = 0.02
 CAMERAS = {name: camera_at((x, 0, 0), size=(WIDTH, HEIGHT), focal=30) for name, x in (("left", 0), ("right", 0.5))}
 
 
-def slanted(view: Camera) -> np.ndarray:
-    """Depth [H, W] of the plane z = 4 + 0.3 x - 0.2 y, seen by a camera that looks along z."""
-    x, y = (np.arange(size) + 0.5 for size in (view.width, view.height))
-    ray_x, ray_y = np.meshgrid((x - view.K[0, 2]) / view.K[0, 0], (y - view.K[1, 2]) / view.K[1, 1])
-    return (WALL + 0.3 * -view.T_camera_world[0, 3]) / (1 - 0.3 * ray_x + 0.2 * ray_y)
+def slanted(name: str) -> np.ndarray:
+    """Depth [H, W] of the plane z = 4 + 0.3 x - 0.2 y in a camera."""
+    return plane_seen_by(CAMERAS[name], (-0.3, 0.2, 1), WALL)
 
 
 def prior_of(depth: np.ndarray | float, label: Label = Label.MONO, sigma: float = SIGMA) -> FusedPrior:
@@ -78,7 +75,7 @@ def test_maps_that_differ_by_more_than_the_tolerance_do_not_and_both_are_less_su
 def test_a_surface_that_another_camera_verified_is_taken_along_the_ray_and_is_no_stereo_of_its_own(
     factor: float,
 ) -> None:
-    truth, theirs = slanted(CAMERAS["left"]), slanted(CAMERAS["right"])
+    truth, theirs = slanted("left"), slanted("right")
     compared = left_of(prior_of(truth * factor), prior_of(theirs, Label.VERIFIED, 0.001))
     met = compared.labels == Label.AGREED
     assert met[2:-2, 8:-2].all(), "the right camera sees all but the columns at the left"
@@ -102,7 +99,7 @@ def test_a_surface_that_another_camera_verified_is_taken_along_the_ray_and_is_no
     ],
 )
 def test_a_surface_farther_than_sigma_or_than_near_is_another_surface(sigma: float, away: float, taken: bool) -> None:
-    truth, theirs = slanted(CAMERAS["left"]), slanted(CAMERAS["right"])
+    truth, theirs = slanted("left"), slanted("right")
     compared = left_of(prior_of(truth * np.exp(away), sigma=sigma), prior_of(theirs, Label.VERIFIED, 0.001))
     assert (share(compared, Label.AGREED) > 0.5) == taken
     assert (share(compared, Label.AGREED) == 0) != taken
@@ -126,7 +123,7 @@ def test_far_and_empty_pixels_have_no_say_and_agreed_ones_do(label: Label) -> No
 
 
 def test_cameras_are_compared_for_the_dual_prior_alone(tmp_path: Path) -> None:
-    recording = synthetic_recording(cameras=3, held_out=0, frames=1, width=160, height=90)
+    recording = synthetic_recording(cameras=3, held_out=0, frames=1, width=120, height=68)
     names = list(recording.cameras)
 
     def labels(settings: PriorSettings) -> np.ndarray:

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from prior_cases import camera_at
+from prior_cases import camera_at, plane_seen_by
 
-from d2_plugin.priors.geometry import viewing_rays
 from d2_plugin.priors.settings import StereoSettings
 from d2_plugin.priors.stereo.filtering.confirm import confirm
 from d2_plugin.priors.stereo.filtering.filter import (
@@ -22,7 +21,7 @@ from d2_plugin.priors.stereo.filtering.filter import (
 )
 from d2_plugin.priors.stereo.filtering.precision import WINDOW, geometric_sigma, grey_gradient, plane_scatter
 from d2_plugin.priors.stereo.geometric_depth import gray
-from d2_plugin.recordings.recording import Camera, Recording
+from d2_plugin.recordings.recording import Recording
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 
 pytest.importorskip("cv2")
@@ -124,10 +123,10 @@ def test_small_pieces_are_speckles_and_depth_steps_cut_pieces() -> None:
 SHAPE = (40, 60)
 
 
-def plane(slope_x: float, slope_y: float, inverse: float = 0.25) -> np.ndarray:
+def plane(slope_x: float, slope_y: float, shape: tuple[int, int] = SHAPE) -> np.ndarray:
     """Depth of a plane: inverse depth is linear over the image."""
-    v, u = np.mgrid[: SHAPE[0], : SHAPE[1]]
-    return (1 / (inverse + slope_x * (u - 30) + slope_y * (v - 20))).astype(np.float32)
+    v, u = np.mgrid[: shape[0], : shape[1]]
+    return (1 / (0.25 + slope_x * (u - shape[1] / 2) + slope_y * (v - shape[0] / 2))).astype(np.float32)
 
 
 def coherence(depth: np.ndarray, gray: np.ndarray | None = None) -> np.ndarray:
@@ -160,19 +159,10 @@ def test_a_depth_edge_along_an_edge_of_the_image_stays_coherent() -> None:
 WIDTH, HEIGHT, BASELINE = 96, 64, 0.5
 
 
-def ground(view: Camera, slope: float) -> np.ndarray:
-    """Planar depth of a ground that rises to the right: y = 1 + slope x in the world; 0 above the horizon."""
-    rays = viewing_rays(view, np.float64)
-    left = -view.T_camera_world[0, 3]
-    falls = rays[..., 1] - slope * rays[..., 0]
-    depth = (1 + slope * left) / np.where(falls > 0.02, falls, np.inf)
-    return depth.astype(np.float32)
-
-
 def sources(slope: float, between: bool) -> tuple[np.ndarray, np.ndarray]:
-    """(how many sources confirm each exact depth of the left camera, that depth)."""
+    """(how many sources confirm each exact depth of the left camera, that depth) of a ground y = 1 + slope x."""
     cameras = [camera_at((x, 0, 0), size=(WIDTH, HEIGHT), focal=90, principal=(0.5, 1 / 8)) for x in (0, BASELINE)]
-    depths = [ground(view, slope) for view in cameras]
+    depths = [plane_seen_by(view, (-slope, 1, 0), 1).astype(np.float32) for view in cameras]
     return confirm(0, cameras, depths, StereoSettings(between_pixels=between, min_angle=0.1)).sources, depths[0]
 
 
@@ -187,12 +177,6 @@ def test_a_ground_at_a_grazing_angle_is_confirmed_between_pixels_and_not_at_them
     assert confirmed_share[False] < 0.7
 
 
-def plane_of(height: int, width: int, unit: float = 1.0) -> np.ndarray:
-    """Depth float32 [H, W] of a slanted plane: inverse depth is linear over the image."""
-    v, u = np.mgrid[:height, :width]
-    return (unit / (0.2 + 0.1 * u / width + 0.05 * v / height)).astype(np.float32)
-
-
 def sigma_of(depth: np.ndarray) -> np.ndarray:
     """Sigma with full coherence, no spread, a textured image and a parallax of 100 pixels."""
     values = {"coherence": 1.0, "parallax": 100.0, "spread": 0.0, "gradient": 0.05}
@@ -201,12 +185,12 @@ def sigma_of(depth: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("unit", [1e-3, 1e6])
 def test_a_plane_does_not_scatter_whatever_the_unit_and_the_size(unit: float) -> None:
-    assert plane_scatter(plane_of(1014, 1352, unit)).max() < 2e-5
+    assert plane_scatter(plane(7e-5, 5e-5, (1014, 1352)) * np.float32(unit)).max() < 2e-5
 
 
 @pytest.mark.parametrize("noise", [1e-3, 1e-2])
 def test_the_scatter_is_the_noise(noise: float) -> None:
-    depth = plane_of(120, 160)
+    depth = plane(6e-4, 4e-4, (120, 160))
     noisy = depth * np.exp(noise * np.random.default_rng(0).standard_normal(depth.shape))
     # Of the window's WINDOW^2 values the plane takes three.
     expected = noise * np.sqrt(1 - 3 / WINDOW**2)

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles import cross_view as cross_view_oracle
 from oracles import stereo_filter as oracle
-from prior_cases import camera_at
+from prior_cases import camera_at, plane_seen_by
 
 from d2_plugin.compiler import NoCompiler, find_compiler
 from d2_plugin.errors import D2Error
@@ -196,7 +196,7 @@ class TestCrossView:
         for index, (width, height) in enumerate(sizes):
             place, angle = unit * random.normal(0, 0.3, 3), random.normal(0, 0.1)
             view = camera_at(place, angle, size=(width, height), principal=tuple(random.normal(0.5, 0.1, 2)))
-            shape, truth = (height, width), wall(view, 3 * unit)
+            shape, truth = (height, width), plane_seen_by(view, (0, 0, 1), 3 * unit)
             verified = random.random((height // 8 + 1, width // 8 + 1)).repeat(8, 0).repeat(8, 1)[:height, :width] < 0.6
             depth = truth * np.exp(np.where(verified, 0, random.normal(0, noise) + random.normal(0, noise / 9, shape)))
             labels = np.where(verified, Label.VERIFIED, Label.MONO)
@@ -267,15 +267,6 @@ class TestCrossView:
             return [map_ for prior in changed for map_ in (prior.labels, prior.depth, prior.sigma)]
 
         same_for_any_threads(maps)
-
-
-def wall(view: Camera, distance: float) -> np.ndarray:
-    """Planar depth [H, W] of the plane z = distance of the world, 0 where a ray does not meet it."""
-    u, v = np.meshgrid(np.arange(view.width) + 0.5, np.arange(view.height) + 0.5)
-    rays = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(view.K).T
-    R = view.T_camera_world[:3, :3]
-    toward, center = (rays @ R)[..., 2], -R.T @ view.T_camera_world[:3, 3]
-    return np.where(toward > 1e-3, (distance - center[2]) / np.where(toward > 1e-3, toward, 1), 0)
 
 
 def test_without_a_compiler_one_sentence_says_so_before_anything_is_built(

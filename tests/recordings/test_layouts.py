@@ -6,18 +6,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from small_layouts import small_recording, write_layout
-from stand_in_recordings import refused
+from small_layouts import CLOUD, small_recording, write_layout
+from stand_in_recordings import refused, write_grey
 
 from d2_plugin.errors import D2Error
 from d2_plugin.recordings import LAYOUTS, Layout, Recording, open_recording
 from d2_plugin.recordings.assembly import assembled
 from d2_plugin.recordings.cameras.camera import CalibratedCamera, pinhole
+from d2_plugin.recordings.cameras.formats.colmap import find_model, read_points
 from d2_plugin.recordings.cameras.lens import Lens
 from d2_plugin.recordings.export.base import Export, Written
 from d2_plugin.recordings.export.export import WRITERS, export_recording
 from d2_plugin.recordings.files import numbered_files
-from d2_plugin.recordings.images import image_size, write_png
+from d2_plugin.recordings.images import image_size
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 
 pytest.importorskip("cv2", reason="opencv is in the `image` extra")
@@ -51,7 +52,7 @@ def test_a_reader_is_two_functions_and_a_row_and_an_export_one_function_and_a_ro
 ) -> None:
     (tmp_path / "focal.txt").write_text("20")
     for frame in (3, 4):
-        write_png(tmp_path / f"{frame}.png", np.full((6, 8, 3), frame, np.uint8))
+        write_grey(tmp_path / f"{frame}.png", frame, (8, 6))
     with pytest.raises(D2Error, match="is no recording"):
         open_recording(tmp_path)
     monkeypatch.setitem(LAYOUTS, "tiny", Layout(is_tiny, open_tiny))
@@ -103,6 +104,8 @@ def test_a_recording_reads_back(layout: str, tmp_path: Path) -> None:
         assert (theirs.width, theirs.height) == (ours.width, ours.height)
         image, expected = read.image(theirs.name, read.frames[1]), written.image(ours.name, written.frames[1])
         assert np.abs(image.astype(int) - expected).mean() < (6 if layout in LENSES else 1e-9)
+    if model := find_model(tmp_path / "recording"):
+        np.testing.assert_allclose(read_points(model).positions, CLOUD.positions)
 
 
 @pytest.mark.parametrize("layout", ["folder", "n3dv", "technicolor", "colmap", "enerf"])

@@ -6,54 +6,32 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from stand_in_recordings import refused
+from stand_in_recordings import refused, write_grey
 
 from d2_plugin.recordings import open_recording
 from d2_plugin.recordings.cameras.rotations import rotation_of_vector
-from d2_plugin.recordings.images import write_png
 
 cv2 = pytest.importorskip("cv2")
+for module in ("yaml", "scipy"):
+    pytest.importorskip(module)
+
+from calibration_writers import Known, easymocap  # noqa: E402  where its packages are
 
 W, H = 48, 32
 R_11 = (1.631797, -1.236095, 0.801056)
 T_11 = (0.327633, 1.096058, 3.260243)
 
 
-def matrix(name: str, values: np.ndarray) -> str:
-    """A matrix as EasyMocap writes it."""
-    values = np.atleast_2d(np.asarray(values, float))
-    numbers = ", ".join(f"{value:.6f}" for value in values.ravel())
-    rows, columns = values.shape
-    return f"{name}: !!opencv-matrix\n  rows: {rows}\n  cols: {columns}\n  dt: d\n  data: [{numbers}]\n"
-
-
-def yaml(path: Path, names: list[str], *entries: str) -> None:
-    listed = "".join(f'  - "{name}"\n' for name in names)
-    path.write_text(f"%YAML:1.0\n---\nnames:\n{listed}" + "".join(entries))
-
-
-def intrinsics(name: str, key: str | None = "dist", k1: float = 0.0) -> str:
-    entry = matrix(f"K_{name}", np.array([[40.1, 0, 25.06], [0, 40.3, 13.3], [0, 0, 1]]))
-    return entry + (matrix(f"{key}_{name}", np.array([[k1, 0, 0, 0, 0]])) if key else "")
-
-
-def extrinsics(name: str) -> str:
-    rotation = cv2.Rodrigues(np.array(R_11))[0]
-    vectors = matrix(f"R_{name}", np.array(R_11)[:, None]) + matrix(f"Rot_{name}", rotation)
-    return vectors + matrix(f"T_{name}", np.array(T_11)[:, None])
-
-
-def scene(path: Path, folders: tuple[str, ...] = ("00", "11"), k1: float = 0.0, key: str | None = "dist") -> Path:
-    """intri.yml knows 00 to 03 and 11, extri.yml 00 and 11; images show the camera's number plus the frame."""
+def scene(path: Path, folders: tuple[str, ...] = ("00", "11"), k1: float = 0.0) -> Path:
+    """intri.yml knows 00 to 03 and 11, extri.yml 00 and 11; images show 10 * camera + frame."""
+    K, R = np.array([[40.1, 0, 25.06], [0, 40.3, 13.3], [0, 0, 1]]), cv2.Rodrigues(np.array(R_11))[0]
+    cameras = [Known(name, (W, H), K, (k1, 0, 0, 0, 0), R, np.array(T_11)) for name in ("00", "01", "02", "03", "11")]
     path.mkdir(parents=True, exist_ok=True)
-    known = ["00", "01", "02", "03", "11"]
-    yaml(path / "intri.yml", known, *(intrinsics(name, key, k1) for name in known))
-    yaml(path / "extri.yml", ["00", "11"], extrinsics("00"), extrinsics("11"))
+    intrinsics = (easymocap(path, cameras) / "intri.yml").read_bytes()
+    (easymocap(path, [cameras[0], cameras[-1]]) / "intri.yml").write_bytes(intrinsics)
     for folder in folders:
         for frame in range(3):
-            file = path / "images" / folder / f"{frame:06d}.png"
-            file.parent.mkdir(parents=True, exist_ok=True)
-            write_png(file, np.full((H, W, 3), 10 * int(folder) + frame, np.uint8))
+            write_grey(path / "images" / folder / f"{frame:06d}.png", 10 * int(folder) + frame, (W, H))
     return path
 
 
@@ -105,10 +83,12 @@ def test_the_matrix_serves_where_the_vector_is_missing(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("key", ["dist", "D"])
 def test_distortion_is_undone_under_either_name(tmp_path: Path, key: str) -> None:
-    recording = open_recording(scene(tmp_path, k1=0.4, key=key))
+    path = scene(tmp_path, k1=0.4)
+    (path / "intri.yml").write_text((path / "intri.yml").read_text().replace("dist_", f"{key}_"))
+    recording = open_recording(path)
     assert any("distortion of 00, 11 is undone" in note for note in recording.notes)
     assert (recording.image("11", 0)[-1, 0] == 0).all()
-    assert not any("undone" in note for note in open_recording(scene(tmp_path, key=None)).notes)
+    assert not any("undone" in note for note in open_recording(scene(tmp_path)).notes)
 
 
 def test_the_folders_name_the_cameras_where_no_list_does(tmp_path: Path) -> None:
@@ -124,5 +104,5 @@ def test_files_that_cannot_be_are_refused(tmp_path: Path) -> None:
     whole = (path / "extri.yml").read_text()
     (path / "extri.yml").write_text(whole.replace("T_11: !!opencv-matrix", "T_11: hello\nother: !!opencv-matrix"))
     refused(path, "T_11 in .* is no matrix")
-    (path / "extri.yml").write_text(whole.replace("rows: 3\n  cols: 1", "rows: 1\n  cols: 3"))
+    (path / "extri.yml").write_text(whole.replace("rows: 3\n   cols: 1", "rows: 1\n   cols: 3"))
     assert list(open_recording(path).cameras) == ["00", "11"]  # a row serves as well as a column

@@ -8,12 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from stand_in_recordings import smooth_recording, write_videos
+from stand_in_recordings import smooth_recording, write_grey, write_videos
 
 from d2_plugin.errors import D2Error
 from d2_plugin.recordings import open_recording
 from d2_plugin.recordings.export.folder import save_recording
-from d2_plugin.recordings.images import write_png
 from d2_plugin.recordings.importing.video import VideoFrames, read_video
 from d2_plugin.recordings.readers.n3dv import camera_from_row
 
@@ -55,9 +54,7 @@ def test_extracted_frames_are_found_in_every_usual_place(tmp_path: Path, pattern
     np.save(tmp_path / "poses_bounds.npy", rows)
     for i, camera in enumerate((2, 13)):  # numbers may be missing: rows belong to the sorted names
         for frame in range(2):
-            path = tmp_path / pattern.format(camera, frame)
-            path.parent.mkdir(parents=True, exist_ok=True)
-            write_png(path, np.full((6, 8, 3), 100 * i + frame, np.uint8))
+            write_grey(tmp_path / pattern.format(camera, frame), 100 * i + frame, (8, 6))
     recording = open_recording(tmp_path)
     assert list(recording.cameras) == ["cam02", "cam13"]
     assert recording.frames == (0, 1)
@@ -71,8 +68,7 @@ def test_rows_and_cameras_must_agree_in_number(tmp_path: Path) -> None:
     np.save(tmp_path / "poses_bounds.npy", np.stack([ROW, ROW]))
     with pytest.raises(D2Error, match=r"no cam\*\.mp4 and no extracted frames"):
         open_recording(tmp_path)
-    (tmp_path / "cam00").mkdir()
-    write_png(tmp_path / "cam00" / "0000.png", np.zeros((6, 8, 3), np.uint8))
+    write_grey(tmp_path / "cam00" / "0000.png", size=(8, 6))
     with pytest.raises(D2Error, match="2 rows for 1 cameras"):
         open_recording(tmp_path)
     np.save(tmp_path / "poses_bounds.npy", ROW)
@@ -90,8 +86,7 @@ def n3dv_scene(folder: Path, rows: int, cameras: tuple[int, ...]) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     np.save(folder / "poses_bounds.npy", table)
     for camera in cameras:
-        (folder / f"cam{camera:02d}").mkdir()
-        write_png(folder / f"cam{camera:02d}" / "0000.png", np.zeros((6, 8, 3), np.uint8))
+        write_grey(folder / f"cam{camera:02d}" / "0000.png", size=(8, 6))
     return folder
 
 

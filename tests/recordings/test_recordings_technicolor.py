@@ -6,10 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from stand_in_recordings import refused
+from stand_in_recordings import refused, write_grey
 
 from d2_plugin.recordings import open_recording
-from d2_plugin.recordings.images import write_png
 
 W, H = 32, 16
 HEADER = "f cu cv ar sk qw qx qy qz tx ty tz\n"
@@ -25,9 +24,7 @@ def rig(path: Path, cameras: int = 3, frames: tuple[int, ...] = (151, 152), **op
     (path / "cameras_parameters.txt").write_text(HEADER + f"{line}\n" * cameras + "\n")
     for camera in range(cameras):
         for i, frame in enumerate(frames):
-            write_png(
-                path / f"{scene}{tag}_{frame:05d}_{camera:02d}.png", np.full((H, W, 3), 10 * camera + i, np.uint8)
-            )
+            write_grey(path / f"{scene}{tag}_{frame:05d}_{camera:02d}.png", 10 * camera + i, (W, H))
     return path
 
 
@@ -51,7 +48,7 @@ def test_the_distorted_release_is_undistorted_on_load(tmp_path: Path) -> None:
     pytest.importorskip("cv2")
     path = rig(tmp_path / "Train", scene="Train", tag="", line=f"{INTRINSICS} 0.4 0.05 {POSE}")
     for file in path.glob("*.png"):
-        write_png(file, np.full((H, W, 3), 200, np.uint8))
+        write_grey(file, 200, (W, H))
     recording = open_recording(path)
     np.testing.assert_array_equal(recording.cameras["00"].T_camera_world[:3, 3], [0.1, -0.2, 0.3])
     assert any("distortion of 00, 01, 02 is undone" in note for note in recording.notes)
@@ -79,10 +76,10 @@ def test_files_that_cannot_be_are_refused(tmp_path: Path) -> None:
     path = rig(tmp_path / "a", frames=())
     refused(path, "no images in .*: expected names like Birthday_undist")
     rig(path)
-    write_png(path / "Birthday_00151_00.png", np.zeros((H, W, 3), np.uint8))
+    write_grey(path / "Birthday_00151_00.png", size=(W, H))
     refused(path, "are both frame 151 of camera 00")
     (path / "Birthday_00151_00.png").unlink()
-    write_png(path / "Train_undist_00151_00.png", np.zeros((H, W, 3), np.uint8))
+    write_grey(path / "Train_undist_00151_00.png", size=(W, H))
     refused(path, "several scenes .birthday, train.")
     (path / "cameras_parameters.txt").write_text(HEADER)
     refused(path, "describes no camera")

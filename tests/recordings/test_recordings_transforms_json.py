@@ -8,18 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from stand_in_recordings import refused
+from stand_in_recordings import refused, write_grey
 
 from d2_plugin.recordings import open_recording
-from d2_plugin.recordings.images import read_image, write_png
+from d2_plugin.recordings.images import read_image
 
 W, H = 32, 24
 Frames = list[dict]
-
-
-def image(path: Path, value: int = 0) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_png(path, np.full((H, W, 3), value, np.uint8))
 
 
 def entry(name: str, x: float = 0.0, **more: object) -> dict:
@@ -31,7 +26,7 @@ def entry(name: str, x: float = 0.0, **more: object) -> dict:
 
 def write(path: Path, frames: Frames, file: str = "transforms.json", **top: object) -> Path:
     for i, frame in enumerate(frames):
-        image(path / f"{frame['file_path']}.png", i)
+        write_grey(path / f"{frame['file_path']}.png", i)
     (path / file).write_text(json.dumps({"camera_angle_x": 1.0, **top, "frames": frames}))
     return path
 

@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 from torch import nn
 
 from d2_plugin.errors import D2Error
+from d2_plugin.gaussians.photometric import ssim
 from d2_plugin.runs import metrics
 from d2_plugin.runs.lpips import find_lpips
 
@@ -49,7 +50,7 @@ def test_ssim1_and_ssim2_are_scikit_images(height: int, width: int, noise: float
 
 
 def test_the_gaussian_ssim_is_the_convolution_of_3dgs() -> None:
-    """Written out with torch's convolution, as the codebases do it."""
+    """The metric and the loss; written out with torch's convolution, as the codebases do it."""
     a, b = (image.double().permute(2, 0, 1)[None] for image in tensors(sine_pair()))
     taps = torch.exp(-((torch.arange(11, dtype=torch.float64) - 5) ** 2) / (2 * 1.5**2))
     window = torch.outer(taps, taps).div(taps.sum() ** 2).expand(3, 1, 11, 11)
@@ -62,6 +63,7 @@ def test_the_gaussian_ssim_is_the_convolution_of_3dgs() -> None:
     top = (2 * mean_a * mean_b + 1e-4) * (2 * cov + 9e-4)
     expected = (top / ((mean_a**2 + mean_b**2 + 1e-4) * (var_a + var_b + 9e-4))).mean().item()
     assert metrics.ssim_3dgs(*tensors(sine_pair())) == pytest.approx(expected, abs=1e-12)
+    assert ssim(*(image.double() for image in tensors(sine_pair()))).item() == pytest.approx(expected, abs=1e-12)
 
 
 def test_psnr_is_in_decibel_and_infinite_for_equal_images() -> None:

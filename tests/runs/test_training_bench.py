@@ -143,17 +143,6 @@ class TestPlan:
         others = [replace(SETTINGS, seed=1), replace(SETTINGS, iterations=5), replace(SETTINGS, downscale=2)]
         assert len({job(SETTINGS), *map(job, others), job(SETTINGS, name="a"), job(SETTINGS, name="a", weight=2)}) == 6
 
-    def test_an_error_of_a_worker_ends_the_whole(self) -> None:
-        def broken(work: Work) -> Future[Row]:
-            future: Future[Row] = Future()
-            future.set_exception(MemoryError("gone"))
-            return future
-
-        settings, case = TrainingBench(("room@a",), steps=(5,)), Case("room", "room", SETTINGS)
-        line = line_of(Method(settings, case, Shared(Path("/out"), "dual"), PRESETS["backbone"], "d2"), [])
-        with pytest.raises(MemoryError):
-            follow([line], broken, lambda row: None)
-
 
 PARENT = """
 import os, time

@@ -98,14 +98,6 @@ def test_no_text_takes_long(tmp_path: Path, text: str) -> None:
     assert time.process_time() - start < 20
 
 
-def test_a_list_of_yaml_is_what_it_says(tmp_path: Path) -> None:
-    (tmp_path / "rig.yml").write_text("a: {b: 1, c: [x, y, {d: 'e'}]}\nf:\n- 1\n- g: ''\n")
-    assert Document(tmp_path / "rig.yml").content == {
-        "a": {"b": "1", "c": ["x", "y", {"d": "e"}]},
-        "f": ["1", {"g": ""}],
-    }
-
-
 @pytest.mark.parametrize("text", ["a: 1\n---\nb: 2\n", "a: 1\n? [x, y]\n: c\n", "a: &x 1\nb: *x\n"])
 def test_yaml_that_no_calibration_needs_is_refused(tmp_path: Path, text: str) -> None:
     (tmp_path / "rig.yml").write_text(text)

@@ -194,10 +194,11 @@ def test_an_adapter_of_the_wrong_object_says_so(name: str, model: tuple) -> None
 def test_a_state_of_other_things() -> None:
     d2 = hooks()
     state = d2.state_dict()
-    three = {"streak": torch.zeros(3, dtype=torch.int64)}
+    three, only_prune = {"streak": torch.zeros(3, dtype=torch.int64)}, replace(ALL_HOOKS, densify=None, depth_loss=None)
     for other, says in (
         ({}, "has no hooks, views, generator, idle, retired: give what d2.state_dict"),
         (None, "has no hooks"),
+        (hooks(config=only_prune).state_dict(), r"has \['densify', 'depth_loss', 'prune'\]"),
         (state | {"hooks": state["hooks"] | {"prune": three}}, r"streak of prune .* of 3 Gaussians"),
         (state | {"hooks": {"densify": {}, "prune": None, "depth_loss": {}}}, "the state of D2 (does not fit|has)"),
         (state | {"inserted_at": torch.zeros(2, dtype=torch.int32)}, "inserted_at of d2 in the checkpoint"),

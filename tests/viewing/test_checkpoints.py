@@ -380,16 +380,6 @@ class TestExport:
             true = FudanAdapter(model).slice_at(seen(open_viewed(path, room), time))
             assert furthest(page, true, time) < 1e-3
 
-    def test_a_network_is_baked(self, room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-        Test4DGaussians.output(tmp_path)
-        assert main(["export", str(tmp_path), "--recording", str(room)]) == 0
-        assert "a deformation field at" in capsys.readouterr().out
-        found = open_viewed(tmp_path, room)
-        page = ReadPage(tmp_path / "export" / "scene.html")
-        assert page.coefficients.shape[1:] == (16, 3)
-        at = found.recording.seconds(found.recording.frames[-1])
-        assert furthest(page, found.backbone.slice_at(seen(found, at)), at) < 1e-3
-
 
 @pytest.mark.parametrize("name", ["hust4d", "swift4d"])
 def test_live_colours_are_those_that_the_field_leaves(name: str, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -94,11 +94,6 @@ def control(page: Page, label: str) -> Any:
     return page.page.locator(f'xpath=//label[text()="{label}"]/../../..').locator("input").first
 
 
-def choose(page: Page, label: str, option: str) -> None:
-    control(page, label).click()
-    page.page.get_by_role("option", name=option, exact=True).click()
-
-
 @pytest.mark.slow
 def test_a_person_moves_camera_and_time_while_another_only_looks(
     new_page: Callable[[], Page], viewed: ViewedRun
@@ -124,25 +119,6 @@ def test_a_person_moves_camera_and_time_while_another_only_looks(
         )
         one.page.close()
         two.page.close()
-
-
-@pytest.mark.slow
-def test_depth_opacity_and_the_prior_as_points(new_page: Callable[[], Page], viewed: ViewedRun) -> None:
-    with showing(viewed) as viewer:
-        page = opened(new_page, viewer)
-        before = settled(page)
-        for show in ("depth", "opacity"):
-            choose(page, "show", show)
-            before = until(page, changed(before))
-        choose(page, "show", "image")
-        before = until(page, changed(before))
-        control(page, "inserted by D2 in orange").click()
-        orange = until(page, changed(before))
-        assert orange[..., 0].mean() > orange[..., 2].mean()
-        choose(page, "prior as points, by", "label")
-        until(page, changed(orange))
-        assert page.errors == []
-        page.page.close()
 
 
 def test_names_stay_text_and_only_this_machine_may_look(new_page: Callable[[], Page], viewed: ViewedRun) -> None:

@@ -17,11 +17,12 @@ pytest.importorskip("av")
 pytest.importorskip("cv2")
 
 
-@pytest.fixture(scope="module")
-def pose2sim(shared_data: Callable[[str], Path], tmp_path_factory: pytest.TempPathFactory) -> Filmed:
+@pytest.fixture
+def pose2sim(shared_data: Callable[[str], Path], tmp_path: Path) -> Callable[[int], Filmed]:
+    """Videos of its first frames."""
     recording = open_recording(shared_data("pose2sim_single"))
-    cut = select_frames(recording, recording.frames[:20])
-    return video(cut, tmp_path_factory.mktemp("pose2sim"), {name: Shooting() for name in recording.cameras})
+    shootings = {name: Shooting() for name in recording.cameras}
+    return lambda frames: video(select_frames(recording, recording.frames[:frames]), tmp_path / "filmed", shootings)
 
 
 def words(filmed: Filmed, run: Path, *more: str) -> list[str]:
@@ -29,9 +30,11 @@ def words(filmed: Filmed, run: Path, *more: str) -> list[str]:
     return [*given, "--output", str(run), "--import.scale", "0.2", *more]
 
 
-def test_four_real_videos_become_a_scene(pose2sim: Filmed, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_four_real_videos_become_a_scene(
+    pose2sim: Callable[[int], Filmed], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     run = tmp_path / "run"
-    command = words(pose2sim, run, "--import.offsets", "none", "--import.frames", "0:3:3", "--hooks", "none")
+    command = words(pose2sim(4), run, "--import.offsets", "none", "--import.frames", "0:3:3", "--hooks", "none")
     assert main([*command, "--iterations", "20"]) == 0
     said = capsys.readouterr().out
     assert "8 images of 4 cameras" in said
@@ -49,8 +52,8 @@ def test_four_real_videos_become_a_scene(pose2sim: Filmed, tmp_path: Path, capsy
 
 
 @pytest.mark.slow
-def test_with_the_whole_method_and_motion_as_the_only_clock(pose2sim: Filmed, tmp_path: Path) -> None:
-    assert main(words(pose2sim, tmp_path / "run", "--import.frames", "0:6:3", "--iterations", "60")) == 0
+def test_with_the_whole_method_and_motion_as_the_only_clock(pose2sim: Callable[[int], Filmed], tmp_path: Path) -> None:
+    assert main(words(pose2sim(20), tmp_path / "run", "--import.frames", "0:6:3", "--iterations", "60")) == 0
     metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert metrics["train"]["psnr"] > 12
     assert metrics["prior"] is not None
