@@ -35,7 +35,7 @@ class TrainersBench(Settings):
     only: tuple[str, ...] = ()
     """Repositories as the launcher names them; all if left out."""
     methods: tuple[str, ...] = METHODS[:3]
-    """Which runs of each: bare, no hooks, attached, with motion."""
+    """Which runs of each: bare, no hooks, attached, with motion, with parallax."""
     iterations: Annotated[int, Range(10, unit="iterations")] = 300
     """Length of each run."""
     own_schedules: bool = False

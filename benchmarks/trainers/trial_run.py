@@ -13,12 +13,14 @@ from benchmarks.trainers.trials import Job, Trial
 from d2_plugin.reading import parse_json, read_text
 from d2_plugin.runs.rows import Row
 
-BARE, NO_HOOKS, ATTACHED, WITH_MOTION = METHODS = ("bare", "no hooks", "attached", "with motion")
+METHODS = ("bare", "no hooks", "attached", "with motion", "with parallax")
+BARE, NO_HOOKS, ATTACHED, WITH_MOTION, WITH_PARALLAX = METHODS
 
 CONFIGURATIONS = {
     NO_HOOKS: 'prior = "{prior}"\n',
     ATTACHED: 'prior = "{prior}"\n[densify]\n[prune]\n[depth_loss]\n',
     WITH_MOTION: 'prior = "{prior}"\n[densify]\n[prune]\n[depth_loss]\n[motion]\n',
+    WITH_PARALLAX: 'prior = "{prior}"\n[densify]\n[prune]\n[depth_loss]\n[parallax]\n',
 }
 """d2.toml of each method: the defaults, with schedules that follow from the length that the trainer announces."""
 

@@ -17,7 +17,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from d2_plugin.hooks.densify import MovingPixels
+from d2_plugin.hooks.densify import FEWEST, MovingPixels
 from d2_plugin.hooks.hook import Context, HookConfig, ImageHook
 from d2_plugin.protocol import DepthPrior, View
 from d2_plugin.settings import Every, Range
@@ -119,11 +119,12 @@ class Parallax(ImageHook):
         if not others:
             return None
         other, part = others[turn % len(others)], PARTS[turn // len(others) % len(PARTS)]
-        lives = [self._moving.intervals(side, context) for side in (view, other)]
-        moving = [life.isfinite() for life in lives if life is not None]
-        key = view.camera, view.frame, other.camera, part, len(moving) == 2
+        ends = view, other
+        compared = all(len(context.instants(end.camera)) >= FEWEST for end in ends)  # what moves is known
+        key = view.camera, view.frame, other.camera, part, compared
         if key not in self._sights:
-            sides = [Side(side, prior) for side in (view, other) if (prior := context.prior(side)) is not None]
+            sides = [Side(end, prior) for end in ends if (prior := context.prior(end)) is not None]
+            moving = [life.isfinite() for end in ends if (life := self._moving.intervals(end, context)) is not None]
             if len(sides) < 2:
                 return None
             if len(moving) == 2:
@@ -199,7 +200,7 @@ def _back_projected(view: View, pixels: Tensor, depth: Tensor) -> Tensor:
 def _unprojected(view: View, seen: Tensor) -> Tensor:
     """World points [3, K] of pixels times their depth, (column, row, 1) * depth [3, K]."""
     projection = view.K @ view.T_camera_world[:3]
-    return torch.linalg.inv(projection[:, :3]) @ (seen - projection[:, 3:])
+    return torch.linalg.inv_ex(projection[:, :3]).inverse @ (seen - projection[:, 3:])
 
 
 def _projected(view: View, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -230,7 +231,8 @@ def _nearest_that_moves(aside: View, sides: Sequence[tuple[View, Tensor]], far: 
 
 def _sampled(maps: Tensor, places: Tensor) -> Tensor:
     """Maps [H, W, C] at places [2, K], in pixels, between their pixels: [K, C]."""
-    grid = 2 * places.T / places.new_tensor([maps.shape[1], maps.shape[0]]) - 1
+    height, width, _ = maps.shape
+    grid = torch.stack([2 / width * places[0] - 1, 2 / height * places[1] - 1], -1)
     maps = maps.permute(2, 0, 1)[None]
     return F.grid_sample(maps, grid[None, None], padding_mode="border", align_corners=False)[0, :, 0].T
 

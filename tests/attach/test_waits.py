@@ -12,12 +12,12 @@ import torch
 from fake_gpu import FakeGpu, OnGpu, fake_gpu, move  # noqa: F401  a fixture
 from hooks.test_motion import Halfway
 from repositories import VARIANTS
-from tiny import HEIGHT, WIDTH
+from tiny import HEIGHT, WIDTH, TinyStore
 from torch import Tensor
 from torch.utils._python_dispatch import _disable_current_modes
 
 from d2_plugin import D2Hooks
-from d2_plugin.config import D2Config, DepthLossConfig, MotionConfig
+from d2_plugin.config import D2Config, DepthLossConfig, MotionConfig, ParallaxConfig
 from d2_plugin.hooks.densify import DensifyConfig
 from d2_plugin.hooks.prune import PruneConfig
 
@@ -32,13 +32,14 @@ SMALL = 512
 """Bytes of matrices and numbers."""
 
 
-def on_the_gpu(name: str) -> tuple[object, list[object]]:
-    """The adapter of a mimic, and one of its cameras at both instants."""
+def on_the_gpu(name: str, instant: bool = False) -> tuple[object, list[object]]:
+    """The adapter of a mimic, and one of its cameras at both instants; or all of them at one instant."""
     moved: dict[int, object] = {}
     with _disable_current_modes():  # what stands on the host need not be counted
         standing = VARIANTS[name]()
     items = name == "gsplat_dynamic"  # a data set's items stay on the host
-    chosen = standing.cameras[:: len(standing.cameras) // 2]
+    half = len(standing.cameras) // 2
+    chosen = standing.cameras[:half] if instant else standing.cameras[::half]
     return move(standing.adapter, moved), [camera if items else move(camera, moved) for camera in chosen]
 
 
@@ -61,6 +62,21 @@ def test_motion_waits_once_a_step(name: str, fake_gpu: FakeGpu) -> None:  # noqa
         waits, copied = own(fake_gpu.where), Counter(fake_gpu.copied)
     assert sum(waits.values()) <= 1 + 2 * (name in ONE_MORE), waits  # their mask for the slice and for its colours
     assert copied["to device"] <= 4 * WIDTH * HEIGHT + SMALL, copied
+
+
+@pytest.mark.parametrize("name", ["fudan", "gsplat", "spacetime"])
+def test_parallax_waits_once_a_step_where_it_knows_what_is_in_sight(name: str, fake_gpu: FakeGpu) -> None:  # noqa: F811
+    adapter, cameras = on_the_gpu(name, instant=True)
+    d2 = D2Hooks(D2Config(finite_every=0, parallax=ParallaxConfig(every=1)), adapter, TinyStore())
+    for step in range(1, 25):  # all others, both parts of the way
+        d2.loss(step, cameras[step % len(cameras)])
+        d2.step(step)
+    with fake_gpu.counting():
+        term = d2.loss(25, cameras[25 % len(cameras)])
+        term.backward()
+        waits, copied = own(fake_gpu.where), Counter(fake_gpu.copied)
+    assert sum(waits.values()) <= 1, waits  # the pairs to sort
+    assert copied["to device"] <= 8 * WIDTH * HEIGHT + SMALL, copied  # its codes and colours
 
 
 def own(waits: Counter[str]) -> Counter[str]:

@@ -122,6 +122,22 @@ def test_what_either_camera_knows_to_stand_before_it_hides_it() -> None:
     assert seen_columns(prior_of(LEFT), other) == [9, 10, 14, 15]
 
 
+def test_what_moves_may_hide_whatever_lies_behind_its_rays() -> None:
+    """A person before the wall whose depth neither camera knows: he covers columns 8 to 11 from the middle."""
+    moving = [torch.zeros(HEIGHT, WIDTH, dtype=torch.bool) for _ in range(2)]
+    away = round(30 * 0.4 / 1.5)  # pixels that he moves by from camera to camera, at half the distance of the wall
+    moving[0][:, 8 + away : 12 + away], moving[1][:, 8 - away : 12 - away] = True, True
+    sides = [Side(view, prior_of(view), moved) for view, moved in zip((LEFT, RIGHT), moving)]
+    pixels, places = in_sight(MIDDLE, *sides)
+    columns = places[0].floor().unique().tolist()
+    assert not {8, 9, 10, 11} & set(columns)
+    assert {4, 5} <= set(columns)  # beside him
+    everything, _ = in_sight(MIDDLE, *(side._replace(moving=None) for side in sides))
+    assert len(pixels) < len(everything)
+    one = [sides[0], sides[1]._replace(moving=torch.zeros_like(moving[1]))]
+    assert len(in_sight(MIDDLE, *one)[0]) == len(everything)  # what one camera alone sees moving is not there
+
+
 @pytest.mark.parametrize(("share", "seen"), [(1.0, True), (1.3, True), (1.8, False), (0.9, False)])
 def test_both_cameras_place_a_surface_within_a_pixel_or_so_of_each_other(share: float, seen: bool) -> None:
     other = prior_of(RIGHT)._replace(depth=share * prior_of(RIGHT).depth)
