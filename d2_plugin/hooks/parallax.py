@@ -54,9 +54,9 @@ LEAST = 0.02
 class ParallaxConfig(HookConfig):
     """Supervision between cameras. Each time costs a render, with gradients."""
 
-    every: Every = 2
+    every: Every = 4
     """Steps from one time to the next."""
-    weight: Annotated[float, Range(0, 1e6)] = 1.0
+    weight: Annotated[float, Range(0, 1e6)] = 2.0
     """Weight beside the trainer's own photometric loss."""
 
     @classmethod
