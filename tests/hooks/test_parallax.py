@@ -186,7 +186,7 @@ def test_what_floats_before_a_surface_gets_fainter() -> None:
 
 def test_it_has_the_weight_that_was_asked_for() -> None:
     adapter = make_adapter(make_model())
-    torch.testing.assert_close(loss_of(adapter, [LEFT, RIGHT], weight=2.0), 2 * loss_of(adapter, [LEFT, RIGHT]))
+    torch.testing.assert_close(loss_of(adapter, [LEFT, RIGHT], weight=6.0), 3 * loss_of(adapter, [LEFT, RIGHT]))
     assert loss_of(adapter, [LEFT, RIGHT], weight=0.0) is None
 
 
