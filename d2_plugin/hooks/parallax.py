@@ -17,7 +17,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from d2_plugin.hooks.densify import FEWEST, MovingPixels
+from d2_plugin.hooks.densify import INSTANTS, MovingPixels
 from d2_plugin.hooks.hook import Context, HookConfig, ImageHook
 from d2_plugin.protocol import DepthPrior, View
 from d2_plugin.settings import Every, Range
@@ -44,7 +44,7 @@ RIM = 4
 """Pixels around what moves that may belong to it."""
 
 KEPT = 512 << 20
-"""Bytes of what is in sight that are kept: it is found once, not at every step."""
+"""Bytes of what is in sight that are kept, so that it is found once."""
 
 LEAST = 0.02
 """Share of a view that must be known on the way: less is not worth a render."""
@@ -92,7 +92,7 @@ class Parallax(ImageHook):
 
     def __init__(self, config: ParallaxConfig) -> None:
         super().__init__(config)
-        self._sights: OrderedDict[tuple[str, int, str, float, bool], Sight] = OrderedDict()
+        self._sights: OrderedDict[tuple[str, int, str, float, int], Sight] = OrderedDict()
         self._bytes = 0
         self._moving = MovingPixels()
 
@@ -120,8 +120,9 @@ class Parallax(ImageHook):
             return None
         other, part = others[turn % len(others)], PARTS[turn // len(others) % len(PARTS)]
         ends = view, other
-        compared = all(len(context.instants(end.camera)) >= FEWEST for end in ends)  # what moves is known
-        key = view.camera, view.frame, other.camera, part, compared
+        # What moves is known better while instants are seen for the first time.
+        instants = min(INSTANTS, *(len(context.instants(end.camera)) for end in ends))
+        key = view.camera, view.frame, other.camera, part, instants
         if key not in self._sights:
             sides = [Side(end, prior) for end in ends if (prior := context.prior(end)) is not None]
             moving = [life.isfinite() for end in ends if (life := self._moving.intervals(end, context)) is not None]

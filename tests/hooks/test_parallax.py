@@ -206,8 +206,34 @@ def test_what_is_kept_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     assert same(*trained)
 
 
+class Lamp(TinyStore):
+    """Images that are dark at two of five instants: what moves depends on how many of them are known."""
+
+    def prior(self, camera: str, frame: int) -> DepthPrior:
+        prior = super().prior(camera, frame)
+        prior.colors[:, :12] = 90 * (frame not in (1, 2))
+        return prior
+
+
+def test_what_is_in_sight_follows_from_the_instants_that_are_known_and_not_from_when_it_was_asked() -> None:
+    """Else a resumed run, which asks anew, would not be the uninterrupted one."""
+    adapter, hook = make_adapter(make_model()), Parallax(ParallaxConfig())
+
+    def context(known: int) -> Context:
+        def instants(camera: str) -> list[View]:
+            end = LEFT if camera == LEFT.camera else RIGHT
+            return [replace(end, frame=frame, time=frame / 5) for frame in range(known)]
+
+        return replace(context_of(adapter, [LEFT, RIGHT], Lamp()), instants=instants)
+
+    first = hook.loss(context(3))
+    later, anew = hook.loss(context(5)), Parallax(ParallaxConfig()).loss(context(5))
+    assert torch.equal(later, anew)
+    assert not torch.equal(first, later)
+
+
 def test_a_resumed_run_is_bitwise_the_uninterrupted_one() -> None:
-    config = D2Config(parallax=ParallaxConfig())
+    config = D2Config(parallax=ParallaxConfig(every=1))
     whole, first, second = (make_trainer(config, iterations=12) for _ in range(3))
     whole.run()
     first.run(5)
