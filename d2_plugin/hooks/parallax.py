@@ -195,19 +195,25 @@ def _back_projected(view: View, pixels: Tensor, depth: Tensor) -> Tensor:
     """World points [3, K] at the depth [H, W] of pixels [K]."""
     row, column = torch.div(pixels, view.width, rounding_mode="floor"), pixels % view.width
     rays = torch.stack([column + 0.5, row + 0.5, torch.ones_like(pixels)])
-    return _unprojected(view, rays * depth.flatten()[pixels].to(view.K))
+    return _unprojected(view, rays * depth.flatten()[pixels].float())
+
+
+def _projection(view: View) -> tuple[Tensor, Tensor]:
+    """Matrix [3, 3] and shift [3, 1] in float64 that take world points to (column, row, 1) * depth."""
+    both = view.K.double() @ view.T_camera_world[:3].double()
+    return both[:, :3], both[:, 3:]
 
 
 def _unprojected(view: View, seen: Tensor) -> Tensor:
     """World points [3, K] of pixels times their depth, (column, row, 1) * depth [3, K]."""
-    projection = view.K @ view.T_camera_world[:3]
-    return torch.linalg.inv_ex(projection[:, :3]).inverse @ (seen - projection[:, 3:])
+    matrix, shift = _projection(view)
+    return torch.linalg.inv_ex(matrix).inverse.float() @ (seen - shift.float())
 
 
 def _projected(view: View, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Places of world points [3, K] in a view, in pixels [2, K], their planar depths [K], and which are in it [K]."""
-    projection = view.K @ view.T_camera_world[:3]
-    image = torch.addmm(projection[:, 3:], projection[:, :3], points)
+    matrix, shift = _projection(view)
+    image = torch.addmm(shift.float(), matrix.float(), points)
     places, depth = image[:2] / image[2].clamp(min=1e-9), image[2]
     inside = (depth > 0) & (places >= 0).all(0) & (places[0] < view.width) & (places[1] < view.height)
     return places, depth, inside
@@ -235,7 +241,7 @@ def _sampled(maps: Tensor, places: Tensor) -> Tensor:
     height, width, _ = maps.shape
     grid = torch.stack([2 / width * places[0] - 1, 2 / height * places[1] - 1], -1)
     maps = maps.permute(2, 0, 1)[None]
-    return F.grid_sample(maps, grid[None, None], padding_mode="border", align_corners=False)[0, :, 0].T
+    return F.grid_sample(maps, grid[None, None].to(maps), padding_mode="border", align_corners=False)[0, :, 0].T
 
 
 def _index(view: View, places: Tensor) -> Tensor:

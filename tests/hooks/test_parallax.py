@@ -161,6 +161,16 @@ def test_the_size_of_the_world_and_its_origin_do_not_matter(size: float, away: f
     torch.testing.assert_close(places[:, common], there[:, torch.isin(expected, pixels)], atol=0.02, rtol=0)
 
 
+def test_views_in_float64_are_as_good() -> None:
+    left, right = (
+        replace(view, K=view.K.double(), T_camera_world=view.T_camera_world.double()) for view in (LEFT, RIGHT)
+    )
+    adapter, context = make_adapter(make_model()), context_of(make_adapter(make_model()), [LEFT, RIGHT])
+    doubled = replace(context, views=[left], beside=lambda view: [left, right], backbone=adapter)
+    losses = [Parallax(ParallaxConfig()).loss(one) for one in (context, doubled)]
+    torch.testing.assert_close(*losses, atol=1e-5, rtol=0)
+
+
 def test_from_the_same_place_all_that_both_know_is_seen() -> None:
     twin = replace(LEFT, camera="twin")
     pixels, _ = in_sight(on_the_way(LEFT, twin, 0.5), Side(LEFT, prior_of(LEFT)), Side(twin, prior_of(LEFT)))
