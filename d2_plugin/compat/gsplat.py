@@ -104,7 +104,6 @@ def _refuse(render_mode: str, camera_model: str, others: dict[str, Any]) -> None
 
 
 def _in_front(means: Tensor, covariances: Tensor, opacities: Tensor, view: View, near: float, far: float) -> Splats:
-    """The Gaussians between the planes of one view."""
     forward = view.T_camera_world[2]
     depths = means.detach() @ forward[:3] + forward[3]
     rows = torch.nonzero((depths > near) & (depths < far)).squeeze(-1)
@@ -112,7 +111,6 @@ def _in_front(means: Tensor, covariances: Tensor, opacities: Tensor, view: View,
 
 
 def _colors(colors: Tensor, sh_degree: int | None, means: Tensor, view: View, number: int) -> Tensor:
-    """[N, D] of one view."""
     if sh_degree is not None:
         pose = view.T_camera_world
         return colors_of(colors.to(means.dtype), sh_degree, means, -pose[:3, :3].T @ pose[:3, 3])
@@ -156,6 +154,5 @@ def _image(image: Render, render_mode: str) -> Tensor:
 
 
 def _centres(means: Tensor, view: View) -> Tensor:
-    """Pixels [M, 2] of means [M, 3]."""
     camera = means @ view.T_camera_world[:3, :3].T.to(means) + view.T_camera_world[:3, 3].to(means)
     return (camera @ view.K.T.to(means))[:, :2] / camera[:, 2:]

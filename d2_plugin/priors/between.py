@@ -274,7 +274,6 @@ def _place(pixels: np.ndarray, prior: DepthPrior, camera: CameraRecord, shape: t
 
 
 def _pixel(point: np.ndarray, camera: CameraRecord) -> np.ndarray:
-    """Where a world point [3] is seen, (column, row)."""
     pose = camera.T_camera_world.numpy()
     seen = camera.K.numpy() @ (pose[:3, :3] @ point + pose[:3, 3])
     pixel: np.ndarray = seen[:2] / seen[2]

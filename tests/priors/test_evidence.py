@@ -12,11 +12,11 @@ from prior_cases import camera_at
 from d2_plugin.priors.build import build_priors
 from d2_plugin.priors.cross_view.kernel import BESIDE, LIKE, NEAR, WITHIN
 from d2_plugin.priors.evidence import AGREED, ALONE, AT_BEST, with_evidence
-from d2_plugin.priors.fuse import FusedPrior
 from d2_plugin.priors.settings import PriorSettings
 from d2_plugin.protocol import Label
 from d2_plugin.recordings.recording import Camera
 from d2_plugin.recordings.synthetic.room import synthetic_recording
+from d2_plugin.store.maps import FusedPrior
 from d2_plugin.store.store import PriorStore
 
 pytest.importorskip("cv2")

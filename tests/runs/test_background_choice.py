@@ -10,7 +10,6 @@ import torch
 from tiny import make_model
 
 from d2_plugin.backbones import yang4d
-from d2_plugin.priors.fuse import FusedPrior
 from d2_plugin.protocol import Label
 from d2_plugin.recordings.export.folder import save_recording
 from d2_plugin.recordings.synthetic.room import synthetic_recording
@@ -18,6 +17,7 @@ from d2_plugin.runs.evaluation import renderer
 from d2_plugin.runs.run import Run
 from d2_plugin.runs.settings import RunSettings
 from d2_plugin.runs.start import TimedPoints
+from d2_plugin.store.maps import FusedPrior
 from d2_plugin.store.store import PriorStore
 
 CAMERAS, FRAMES, HEIGHT, WIDTH = ("train0", "train1"), (0, 1), 54, 96

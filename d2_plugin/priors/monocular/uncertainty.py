@@ -212,7 +212,6 @@ def error_shape(depth: np.ndarray, anchors: np.ndarray, at: np.ndarray | None = 
 
 
 def _count(masks: np.ndarray) -> np.ndarray:
-    """How many pixels each of the masks [n, H, W] has."""
     return np.array([np.count_nonzero(mask) for mask in masks], np.int64)
 
 

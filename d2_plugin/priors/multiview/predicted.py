@@ -125,6 +125,5 @@ def _shaped(values: np.ndarray, shape: tuple[int, ...], name: str, where: str) -
 
 
 def _inverted(poses: np.ndarray) -> np.ndarray:
-    """Rigid motions [V, 3, 4] the other way."""
     turned = poses[:, :, :3].transpose(0, 2, 1)
     return np.concatenate([turned, -turned @ poses[:, :, 3:]], axis=2)

@@ -198,5 +198,4 @@ def _surface(solid: Solid, points: np.ndarray, seconds: float) -> tuple[np.ndarr
 
 
 def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Inner products [R] of two [3, R] (or [3, 1])."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
