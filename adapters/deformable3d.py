@@ -107,7 +107,6 @@ class Deformable3DAdapter(InriaAdapter):
         return torch.einsum("nij,nj->ni", motion[:, :3, :3], positions) + motion[:, :3, 3]
 
     def _time(self, camera: Any) -> float:
-        """`fid`, a tensor of one number."""
         return self._fid(camera)
 
     def _append(self, points: Points) -> None:

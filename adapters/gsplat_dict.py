@@ -20,6 +20,7 @@ from torch import Tensor
 
 from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.rotation4d import unit_quaternions
+from d2_plugin.gaussians.spherical_harmonics import coefficients_from_rgb
 from d2_plugin.protocol import Points, RasterSettings, Splats, View
 
 from .keys import ViewsByPose
@@ -27,7 +28,6 @@ from .shared import (
     Renders,
     Resizing,
     appended,
-    constant_harmonics,
     finite,
     identities,
     on_device,
@@ -162,7 +162,8 @@ class GsplatAdapter(Resizing):
         self._report_changes()
         index = torch.nonzero(~mask).squeeze(-1)
         for name, old in list(self.parameters.items()):
-            self._keep(name, old, index)
+            kept = old.detach()[index]
+            self.parameters[name] = replaced(self.optimizers[name], old, kept, lambda moment: moment[index])
         if self.scene is not None:
             self.scene.on_remove(mask)
         self._change_state(lambda old: old[index], index)
@@ -179,7 +180,7 @@ class GsplatAdapter(Resizing):
             "scales": points.scales.log()[:, None].repeat(1, 3),
             "quats": identities(count, like),
             "opacities": torch.logit(points.opacities, eps=1e-6),
-            "sh0": constant_harmonics(points.colors),
+            "sh0": coefficients_from_rgb(points.colors, 0, 0),
             "colors": torch.logit(points.colors, eps=1e-3),
         }
         if "shN" in self.parameters:
@@ -193,16 +194,6 @@ class GsplatAdapter(Resizing):
                     "adapter a function `new_rows` that returns its rows for inserted points"
                 )
         return {name: known[name] for name in self.parameters}
-
-    def _keep(self, name: str, old: Tensor, index: Tensor) -> None:
-        """The rows of `index` of one parameter, in the dict and in its optimizer, with their moments."""
-        optimizer = self.optimizers[name]
-        moments = optimizer.state.pop(old, {})
-        for key, value in moments.items():
-            if key != "step" and isinstance(value, Tensor) and value.shape[:1] == old.shape[:1]:
-                moments[key] = value[index]
-        kept = torch.nn.Parameter(old.detach()[index], requires_grad=old.requires_grad)
-        self.parameters[name] = replaced(optimizer, old, kept, moments)
 
     def _change_state(self, change: Callable[[Tensor], Tensor], index: Tensor) -> None:
         state = {} if self.state is None else self.state
@@ -227,7 +218,6 @@ class GsplatAdapter(Resizing):
             self._see(numbers)
 
     def _see(self, numbers: Tensor) -> None:
-        """Put row numbers into the state that are those of the present rows."""
         assert self.state is not None
         self.state[ROWS], self._seen, self._version = numbers, numbers, numbers._version
 

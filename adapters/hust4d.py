@@ -98,7 +98,6 @@ class Hust4DAdapter(InriaAdapter):
         return self._field(raw, time) if self.stage == "fine" and len(self) else raw
 
     def _field(self, raw: tuple[Tensor, ...], time: float) -> tuple[Tensor, ...]:
-        """Raw attributes, deformed."""
         times = raw[0].new_full((len(raw[0]), 1), time)
         moved: tuple[Tensor, ...] = self._own(self.gaussians._deformation, *raw, times)
         return moved
@@ -147,7 +146,6 @@ class Hust4DAdapter(InriaAdapter):
         return points.select(inside)
 
     def _deformed(self, positions: Tensor, time: float) -> Tensor:
-        """Where the field carries canonical positions."""
         return self._field(self._blank(positions), time)[0] if len(positions) else positions
 
     def _blank(self, positions: Tensor) -> tuple[Tensor, ...]:

@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 
 from d2_plugin.errors import D2Error
+from d2_plugin.gaussians.spherical_harmonics import coefficients_from_rgb
 from d2_plugin.protocol import Points, RasterSettings, Splats, View
 from d2_plugin.rasterizer import rasterize
 
@@ -30,7 +31,6 @@ from .shared import (
     Renders,
     Resizing,
     appended,
-    constant_harmonics,
     finite,
     identities,
     on_device,
@@ -216,7 +216,6 @@ class InriaAdapter(Resizing, ABC):
         return known if known is not None and len(known[0]) == len(self) else self._own(field, *inputs)
 
     def _own(self, field: Callable[..., Any], *inputs: Any) -> Any:
-        """An evaluation of the field that is not the trainer's."""
         self._asking = True
         try:
             return field(*inputs)
@@ -245,7 +244,6 @@ class InriaAdapter(Resizing, ABC):
         """Append the raw rows of finite points."""
 
     def _time(self, camera: Any) -> float:
-        """The instant of a camera in the backbone's unit."""
         return float(camera.timestamp)
 
     def _key_of(self, camera: Any) -> PriorKey:
@@ -305,12 +303,11 @@ class InriaAdapter(Resizing, ABC):
             setattr(self.gaussians, name, torch.cat([value, fresh]))
 
     def _raw_rows(self, points: Points) -> RawRows:
-        """Raw rows of isotropic Gaussians in the shapes that this model has."""
         model, count = self.gaussians, len(points.positions)
         rest = optional(model, "_features_rest")
         return RawRows(
             xyz=points.positions,
-            features_dc=constant_harmonics(points.colors),
+            features_dc=coefficients_from_rgb(points.colors, 0, 0),
             features_rest=points.positions.new_zeros(count, *(rest.shape[1:] if rest is not None else (0, 3))),
             opacity=torch.logit(points.opacities, eps=1e-6)[:, None],
             scaling=points.scales.log()[:, None].repeat(1, model._scaling.shape[1]),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -100,7 +99,7 @@ def invert_at_times(points: Points, deformed: Callable[[Tensor, float], Tensor],
         chosen = torch.nonzero(points.times == time).squeeze(-1)
         moved = deformed(present, time)
         inversion = invert_deformation(
-            partial(_at, deformed, time),
+            lambda positions: deformed(positions, time),  # noqa: B023  called before the next time
             points.positions[chosen],
             moved,
             moved - present,
@@ -130,7 +129,3 @@ def values_of_neighbours(points: Points, means_at: Callable[[float], Tensor], va
         chosen = points.times == time
         nearest[chosen] = neighbour_offsets(points.positions[chosen], means_at(time).detach(), values)
     return nearest
-
-
-def _at(deformed: Callable[[Tensor, float], Tensor], time: float, positions: Tensor) -> Tensor:
-    return deformed(positions, time)

@@ -78,7 +78,6 @@ def one_image_each(camera: Any) -> PriorKey:
 
 
 def _stem(name: str) -> str:
-    """The file's name without folders and without the suffix of an image."""
     path = PurePosixPath(name.replace("\\", "/"))
     return path.stem if path.suffix and not path.suffix[1:].isdigit() else path.name
 

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from d2_plugin.gaussians.rotation4d import covariances_from_factors, rotation_matrices_3d
-from d2_plugin.gaussians.spherical_harmonics import SH_C0, channel_count
+from d2_plugin.gaussians.spherical_harmonics import channel_count
 from d2_plugin.gaussians.spherical_harmonics import colors as harmonic_colors
 from d2_plugin.protocol import Points, ResizeListener, Splats, View
 
@@ -137,11 +137,6 @@ def seen_colors(
     return harmonic_colors(chosen, splats.means - centre, phase, degree, time_degree)
 
 
-def constant_harmonics(colors: Tensor) -> Tensor:
-    """The coefficients [K, 1, 3] of colours [K, 3] that are the same from everywhere."""
-    return ((colors - 0.5) / SH_C0)[:, None, :]
-
-
 def identities(count: int, like: Tensor) -> Tensor:
     """Quaternions [count, 4] that turn nothing."""
     rotations = like.new_zeros(count, 4)
@@ -158,18 +153,19 @@ def appended(before: int, after: int, device: torch.device) -> Tensor:
 
 def with_rows(optimizer: torch.optim.Optimizer, old: Tensor, rows: Tensor) -> torch.nn.Parameter:
     """A parameter with new rows at the end in the place of `old` in its optimizer, with moments of zero there."""
-    new = torch.nn.Parameter(torch.cat([old.detach(), rows.to(old)]), requires_grad=old.requires_grad)
-    moments = optimizer.state.pop(old, {})
-    for name, value in moments.items():
-        if isinstance(value, Tensor) and value.shape[:1] == old.shape[:1] and name != "step":
-            moments[name] = torch.cat([value, torch.zeros_like(rows).to(value)])
-    return replaced(optimizer, old, new, moments)
+    grown = torch.cat([old.detach(), rows.to(old)])
+    return replaced(optimizer, old, grown, lambda moment: torch.cat([moment, torch.zeros_like(rows).to(moment)]))
 
 
 def replaced(
-    optimizer: torch.optim.Optimizer, old: Tensor, new: torch.nn.Parameter, moments: dict[str, Any]
+    optimizer: torch.optim.Optimizer, old: Tensor, values: Tensor, change: Callable[[Tensor], Tensor]
 ) -> torch.nn.Parameter:
-    """`new` in the place of `old` in the optimizer, with these moments."""
+    """A parameter with these values in the place of `old` in its optimizer, whose moments of rows are changed."""
+    new = torch.nn.Parameter(values, requires_grad=old.requires_grad)
+    moments = optimizer.state.pop(old, {})
+    for name, value in moments.items():
+        if isinstance(value, Tensor) and value.shape[:1] == old.shape[:1] and name != "step":
+            moments[name] = change(value)
     if moments:
         optimizer.state[new] = moments
     for group in optimizer.param_groups:

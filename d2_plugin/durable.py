@@ -97,10 +97,27 @@ def write(path: Path, *parts: bytes | memoryview, synced: bool = True) -> None:
         CannotWrite: the disk is full, broken or not ours; what was there before is there still.
     """
     make_folder(path.parent)
+    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_CLOEXEC", 0)
+    with replacing(path) as temporary:
+        descriptor = os.open(temporary, flags, 0o666)
+        try:
+            for part in parts:
+                rest = memoryview(part).cast("B") if memoryview(part).nbytes else memoryview(b"")
+                while rest:
+                    rest = rest[os.write(descriptor, rest) :]
+            if synced:
+                os.fsync(descriptor)  # before the rename, or a power cut may leave the new name with nothing in it
+        finally:
+            os.close(descriptor)
+
+
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """A temporary name beside `path`: what is written there takes its place if the block ends without an error."""
     temporary = path.with_name(f".{secrets.token_hex(8)}{LEFTOVER}")
     with writing(path):
         try:
-            _write_new(temporary, parts, synced)
+            yield temporary
             os.replace(temporary, path)
         except BaseException:
             with contextlib.suppress(OSError):
@@ -127,20 +144,6 @@ def append(path: Path, text: str) -> None:
         except BaseException:
             file.truncate(size)
             raise
-
-
-def _write_new(path: Path, parts: tuple[bytes | memoryview, ...], synced: bool) -> None:
-    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_CLOEXEC", 0)
-    descriptor = os.open(path, flags, 0o666)
-    try:
-        for part in parts:
-            rest = memoryview(part).cast("B") if memoryview(part).nbytes else memoryview(b"")
-            while rest:
-                rest = rest[os.write(descriptor, rest) :]
-        if synced:
-            os.fsync(descriptor)  # before the rename, or a power cut may leave the new name with nothing in it
-    finally:
-        os.close(descriptor)
 
 
 def refuse_inside_images(path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Progress of long work: a bar where `rich` is installed and a person watches, a line now and then otherwise."""
+"""What long work says: a bar where `rich` is installed and a person watches, a line now and then otherwise."""
 
 from __future__ import annotations
 
@@ -9,10 +9,17 @@ from contextlib import contextmanager
 from typing import Any, Protocol
 
 
+def show(*lines: str) -> None:
+    """Print at once, before long work starts."""
+    sys.stdout.write("".join(f"{line}\n" for line in lines))
+    sys.stdout.flush()
+
+
 class Bar(Protocol):
     """One piece of work of known length."""
 
-    def update(self, done: int, note: str = "") -> None: ...
+    def update(self, done: int, note: str = "") -> None:
+        """`done` units of work are finished; `note` is shown behind."""
 
 
 class _Lines:
@@ -24,7 +31,6 @@ class _Lines:
         self._first: tuple[float, int] | None = None
 
     def update(self, done: int, note: str = "") -> None:
-        """`done` units of work are finished; `note` is shown behind."""
         now = time.monotonic()
         since, before = self._first = self._first or (now, done)  # what starts workers is not repeated for each unit
         if now - self.last < 10 and done < self.total:
@@ -39,7 +45,6 @@ class _Rich:
         self._progress, self._task = progress, task
 
     def update(self, done: int, note: str = "") -> None:
-        """`done` units of work are finished; `note` is shown behind."""
         self._progress.update(self._task, completed=done, note=note)
 
 

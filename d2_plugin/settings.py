@@ -23,10 +23,8 @@ from typing import Annotated, Any, NamedTuple, TypeVar, cast, get_args
 
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.older import hints_of
-from d2_plugin.values import UNBOUNDED, bare_and_range, options_of, shown
-from d2_plugin.values import OutOfRange as OutOfRange
+from d2_plugin.values import UNBOUNDED, bare_and_range, checked, options_of, shown
 from d2_plugin.values import Range as Range
-from d2_plugin.values import checked as checked
 
 
 @dataclass(frozen=True)

@@ -215,7 +215,6 @@ def bare_and_range(hint: Any) -> tuple[Any, Range]:
 
 
 def _noun(kind: Any) -> str:
-    """What a value of this kind is called in a sentence."""
     if _is_choice(kind):
         return f"one of {', '.join(map(str, get_args(kind)))}"
     if get_origin(kind) is tuple or get_origin(kind) in LISTS:

@@ -10,15 +10,12 @@ The contract's rows are the splats, one table; the table of motions has no row o
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
-from torch import Tensor
 
 from d2_plugin.protocol import Points
 
 from ..ex4dgs import Ex4DGSAdapter
-from ..inria import InriaAdapter, Report
+from ..inria import InriaAdapter
 
 ROOT = -1
 """The parent of a splat that has none, in `_parent`."""
@@ -33,19 +30,15 @@ class CEM4DGSAdapter(Ex4DGSAdapter):
 
     Its `get_..._at_t` give the splats of an instant in the order of that table, so the slice is Ex4DGS's.
 
-    Inserted Gaussians are splats of level 0 without drift; the repository hangs those that do not fit on motions.
+    Inserted Gaussians are splats of level 0 without drift; the repository hangs those that do not fit on motions, and
+    deletes motions without children itself.
     """
 
-    def __len__(self) -> int:
-        return len(self.gaussians._xyz)
-
-    def _harmonics(self) -> Tensor:
-        return InriaAdapter._harmonics(self)
-
-    @torch.no_grad()
-    def remove(self, mask: Tensor) -> None:
-        """Delete the splats where `mask` [N] is True; motions without children are the repository's to delete."""
-        self.gaussians.prune_points(mask)
+    __len__ = InriaAdapter.__len__
+    remove = InriaAdapter.remove
+    _harmonics = InriaAdapter._harmonics
+    _before_append = InriaAdapter._before_append
+    _before_prune = InriaAdapter._before_prune  # type: ignore[assignment]  # one mask for one table
 
     def _append(self, points: Points) -> None:
         """As splats of level 0, whose parents and levels its callers lengthen by hand: splats come before motions."""
@@ -63,11 +56,3 @@ class CEM4DGSAdapter(Ex4DGSAdapter):
 
     def _sizes(self) -> tuple[int, int]:
         return len(self.gaussians._xyz), 0
-
-    def _before_append(self, *_: Any, **__: Any) -> Report:
-        return InriaAdapter._before_append(self)
-
-    def _before_prune(  # type: ignore[override]
-        self, static_mask: Tensor, *_: Any, **__: Any
-    ) -> Report:
-        return InriaAdapter._before_prune(self, static_mask)

@@ -18,13 +18,13 @@ from torch import Tensor
 
 from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.slicing import slice_gaussians
+from d2_plugin.gaussians.spherical_harmonics import coefficients_from_rgb
 from d2_plugin.protocol import Points, RasterSettings, Splats, View
 
 from ..keys import KeyOf, PriorKey, key_from_image_name
 from ..shared import (
     Resizing,
     appended,
-    constant_harmonics,
     finite,
     identities,
     on_device,
@@ -140,7 +140,7 @@ class FasterGS4DAdapter(Resizing):
         return {
             "spatial_means": points.positions,
             "temporal_means": points.times[:, None],
-            "sh_coefficients_0": constant_harmonics(points.colors),
+            "sh_coefficients_0": coefficients_from_rgb(points.colors, 0, 0),
             "sh_coefficients_rest": points.positions.new_zeros(count, *model._sh_coefficients_rest.shape[1:]),
             "opacities": torch.logit(points.opacities, eps=1e-6)[:, None],
             "spatial_scales": points.scales.log()[:, None].repeat(1, 3),

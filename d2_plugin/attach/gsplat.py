@@ -12,12 +12,11 @@ import importlib.util
 import logging
 import sys
 from collections.abc import Callable, Mapping
-from functools import wraps
 from typing import Any, NamedTuple
 
 import torch
 
-from d2_plugin.attach.session import AddGradient, Session
+from d2_plugin.attach.session import AddGradient, Session, wrap_attribute
 from d2_plugin.errors import D2Error
 
 log = logging.getLogger(__name__)
@@ -85,7 +84,6 @@ class GsplatSession(Session):
             wrap_attribute(importlib.import_module(module), attribute, self._drawing)
 
     def _source(self) -> str | None:
-        """What the script's parser reads."""
         return getattr(self.objects.scene, "data_dir", None)
 
     def _keeping_settings(self, cli: Callable[..., Any], main: Any, settings: Any, *more: Any, **named: Any) -> Any:
@@ -117,14 +115,3 @@ class GsplatSession(Session):
         poses = torch.linalg.inv_ex(named["viewmats"].detach()).inverse
         term = self._term(self.hooks, [{"camtoworld": pose, "K": K, **size} for pose, K in zip(poses, named["Ks"])])
         return drawn if term is None else (AddGradient.apply(drawn[0], term, 1.0), *drawn[1:])
-
-
-def wrap_attribute(owner: Any, name: str, around: Callable[..., Any]) -> None:
-    """Replace a function of a module or a class by `around`, which gets the original before the arguments."""
-    original = getattr(owner, name)
-
-    @wraps(original)
-    def wrapped(*arguments: Any, **named: Any) -> Any:
-        return around(original, *arguments, **named)
-
-    setattr(owner, name, wrapped)

@@ -9,7 +9,7 @@ from typing import Any
 from d2_plugin.attach.gsplat import GsplatSession, put_in_place
 from d2_plugin.attach.repairs import saves_parents
 from d2_plugin.attach.session import Adapter, Objects, Original, Recipe
-from d2_plugin.errors import unknown_name
+from d2_plugin.errors import refuse_unknown
 from d2_plugin.protocol import Backbone
 
 
@@ -21,10 +21,6 @@ def _deformable3d(adapter: Adapter, objects: Objects) -> Backbone:
     arguments, _ = objects.given.get("scene", ((None,), {}))
     exact = bool(getattr(arguments[0], "is_blender", False))
     return adapter(objects.model, objects.deform, warm_up=objects.options.warm_up, exact_times=exact)
-
-
-def _hust4d(adapter: Adapter, objects: Objects) -> Backbone:
-    return adapter(objects.model, objects.scene, "coarse")  # each render says the stage, see `_enter_stage`
 
 
 def _enter_stage(adapter: Any, named: Mapping[str, Any]) -> None:
@@ -43,10 +39,6 @@ def _spacetime(adapter: Adapter, objects: Objects) -> Backbone:
 def _ex4dgs(adapter: Adapter, objects: Objects) -> Backbone:
     dataset = objects.given["scene"][0][0]
     return adapter(objects.model, near=dataset.near, far=dataset.far)
-
-
-def _gsplat(adapter: Adapter, objects: Objects) -> Backbone:
-    return adapter(*objects.model, objects.state, parser=objects.scene, scene=objects.gaussians)
 
 
 _KNN = Original("simple_knn._C", "d2_plugin.compat.nearest")
@@ -85,7 +77,7 @@ RECIPES = {
     ),
     "hust4d": Recipe(
         "hust4d",
-        _hust4d,
+        lambda adapter, objects: adapter(objects.model, objects.scene, "coarse"),  # see `_enter_stage`
         (Original("diff_gaussian_rasterization", "d2_plugin.compat.depth"), _KNN),
         before_loss=_enter_stage,
     ),
@@ -118,7 +110,7 @@ RECIPES = {
     ),
     "gsplat": Recipe(
         "gsplat",
-        _gsplat,
+        lambda adapter, made: adapter(*made.model, made.state, parser=made.scene, scene=made.gaussians),
         (Original("gsplat.csrc", "d2_plugin.compat.gsplat", loader=("gsplat.cuda._backend", "_C")),),
         models=(),
         renderers=(),
@@ -133,6 +125,5 @@ RECIPES = {
 
 def recipe(name: str) -> Recipe:
     """The recipe of that name; an unknown name is refused, with the known ones."""
-    if name not in RECIPES:
-        raise unknown_name("repository", name, RECIPES)
+    refuse_unknown("repository", [name], RECIPES)
     return RECIPES[name]

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import json
 import logging
-from functools import wraps
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
-from d2_plugin.attach.session import attribute_of
+from d2_plugin.attach.session import attribute_of, wrap_attribute
 
 log = logging.getLogger(__name__)
 
@@ -39,14 +39,12 @@ def _pillow() -> str | None:
         return None
     if int(__version__.split(".")[0]) < 11:
         return None
-    original = Image.fromarray
 
-    @wraps(original)
-    def fromarray(obj: Any, *arguments: Any, **named: Any) -> Any:
+    def fromarray(original: Callable[..., Any], obj: Any, *arguments: Any, **named: Any) -> Any:
         values = obj.view(np.uint8) if getattr(obj, "dtype", None) == np.int8 else obj
         return original(values, *arguments, **named)
 
-    Image.fromarray = fromarray
+    wrap_attribute(Image, "fromarray", fromarray)
     return f"Pillow {__version__} takes no signed bytes: Image.fromarray reads them as unsigned in this process"
 
 
@@ -62,13 +60,11 @@ def _joblib() -> str | None:
 
 def _json() -> str:
     """cem-4dgs writes scikit-image's SSIM as JSON, which later versions return in single precision (train.py:450)."""
-    original = json.JSONEncoder.default
 
-    @wraps(original)
-    def default(encoder: json.JSONEncoder, o: Any) -> Any:
+    def default(original: Callable[..., Any], encoder: json.JSONEncoder, o: Any) -> Any:
         return o.item() if isinstance(o, np.generic) else original(encoder, o)
 
-    json.JSONEncoder.default = default  # type: ignore[method-assign, assignment]
+    wrap_attribute(json.JSONEncoder, "default", default)
     return "numbers of numpy are written as JSON like Python's own"
 
 
@@ -77,11 +73,8 @@ def saves_parents() -> None:
 
     The `save_ply` of its class VGaussianModel then sees the number that numpy 1 wrote.
     """
-    model = attribute_of("scene.v_gaussian_model", "VGaussianModel")
-    original = model.save_ply
 
-    @wraps(original)
-    def save_ply(self: Any, *arguments: Any, **named: Any) -> Any:
+    def save_ply(original: Callable[..., Any], self: Any, *arguments: Any, **named: Any) -> Any:
         parents = self._parent
         self._parent = parents.long() & 0xFFFFFFFF
         try:
@@ -89,4 +82,4 @@ def saves_parents() -> None:
         finally:
             self._parent = parents
 
-    model.save_ply = save_ply
+    wrap_attribute(attribute_of("scene.v_gaussian_model", "VGaussianModel"), "save_ply", save_ply)

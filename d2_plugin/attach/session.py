@@ -27,7 +27,6 @@ Adapter = Callable[..., Backbone]
 Place = tuple[str, str]
 """A module of the repository and one of its attributes."""
 
-
 MUCH_GROWTH = 3
 """Gaussians of the trainer's own densification for each one that D2 inserted, above which the log names them."""
 
@@ -146,24 +145,23 @@ class Session:
             self.keep_instances(attribute_of(*place), name)
         for place in self.recipe.models:
             model = attribute_of(*place)
-            model.training_setup = self._attaching(model.training_setup)
+            wrap_attribute(model, "training_setup", self._attaching)
             if hasattr(model, "update_learning_rate"):
-                model.update_learning_rate = self._counting(model.update_learning_rate)
+                wrap_attribute(model, "update_learning_rate", self._counting)
         for place in self.recipe.renderers if self.config is not None else ():
-            setattr(importlib.import_module(place[0]), place[1], self._rendering(attribute_of(*place)))
+            attribute_of(*place)  # says what is missing
+            wrap_attribute(importlib.import_module(place[0]), place[1], self._rendering)
 
     def keep_instances(self, kind: type, name: str) -> None:
         """Keep the latest instance of a class, and what it was made from, under `name` of the objects."""
-        original = kind.__init__  # type: ignore[misc]
 
-        @wraps(original)
-        def remembering(instance: Any, *arguments: Any, **named: Any) -> None:
+        def remembering(original: Callable[..., None], instance: Any, *arguments: Any, **named: Any) -> None:
             # Before the call: a scene builds its model inside, and may be asked for before it returns.
             setattr(self.objects, name, instance)
             self.objects.given[name] = arguments, named
             original(instance, *arguments, **named)
 
-        kind.__init__ = remembering  # type: ignore[misc]  # a foreign class, overridden for all its instances
+        wrap_attribute(kind, "__init__", remembering)  # a foreign class, overridden for all its instances
 
     def end(self) -> None:
         """Log what D2 did, at the end of the script."""
@@ -172,17 +170,15 @@ class Session:
         elif self.config is not None:
             log.warning("the trainer never called training_setup: D2 was not attached")
 
-    def _attaching(self, training_setup: Callable[..., Any]) -> Callable[..., Any]:
-        @wraps(training_setup)
-        def attaching(model: Any, options: Any, *arguments: Any, **named: Any) -> Any:
-            self.objects.model, self.objects.options = model, options
-            result = training_setup(model, options, *arguments, **named)
-            if self.config is not None:
-                self.attach(getattr(options, "iterations", None))
-                self._watch(model.optimizer)
-            return result
-
-        return attaching
+    def _attaching(
+        self, training_setup: Callable[..., Any], model: Any, options: Any, *arguments: Any, **named: Any
+    ) -> Any:
+        self.objects.model, self.objects.options = model, options
+        result = training_setup(model, options, *arguments, **named)
+        if self.config is not None:
+            self.attach(getattr(options, "iterations", None))
+            self._watch(model.optimizer)
+        return result
 
     def attach(self, iterations: int | None) -> None:
         """Make the adapter and the hooks of the objects seen, for a run of that many iterations."""
@@ -207,32 +203,27 @@ class Session:
         return export_read(Path(config.prior), Path(source))
 
     def _source(self) -> str | None:
-        """The folder that the trainer reads."""
         arguments, _ = self.objects.given.get("scene", ((None,), {}))
         return getattr(next(iter(arguments), None), "source_path", None)
 
-    def _counting(self, update_learning_rate: Callable[..., Any]) -> Callable[..., Any]:
-        @wraps(update_learning_rate)
-        def counting(model: Any, iteration: int, *arguments: Any, **named: Any) -> Any:
-            self._iteration, self._counted = iteration, True
-            return update_learning_rate(model, iteration, *arguments, **named)
+    def _counting(
+        self, update_learning_rate: Callable[..., Any], model: Any, iteration: int, *arguments: Any, **named: Any
+    ) -> Any:
+        self._iteration, self._counted = iteration, True
+        return update_learning_rate(model, iteration, *arguments, **named)
 
-        return counting
-
-    def _rendering(self, render: Callable[..., Mapping[str, Any]]) -> Callable[..., Mapping[str, Any]]:
-        @wraps(render)
-        def rendering(camera: Any, model: Any, *arguments: Any, **named: Any) -> Mapping[str, Any]:
-            if self.hooks is not None and model is self.objects.model and torch.is_grad_enabled():
-                self.hooks.prefetch([camera])  # its prior is read while it is drawn
-            package = render(camera, model, *arguments, **named)
-            training = torch.is_grad_enabled() and package["render"].requires_grad
-            if self.hooks is None or model is not self.objects.model or not training:
-                return package
-            if self.recipe.before_loss is not None:
-                self.recipe.before_loss(self.hooks.backbone, named)
-            return self._with_loss(self.hooks, camera, package)
-
-        return rendering
+    def _rendering(
+        self, render: Callable[..., Mapping[str, Any]], camera: Any, model: Any, *arguments: Any, **named: Any
+    ) -> Mapping[str, Any]:
+        if self.hooks is not None and model is self.objects.model and torch.is_grad_enabled():
+            self.hooks.prefetch([camera])  # its prior is read while it is drawn
+        package = render(camera, model, *arguments, **named)
+        training = torch.is_grad_enabled() and package["render"].requires_grad
+        if self.hooks is None or model is not self.objects.model or not training:
+            return package
+        if self.recipe.before_loss is not None:
+            self.recipe.before_loss(self.hooks.backbone, named)
+        return self._with_loss(self.hooks, camera, package)
 
     def _with_loss(self, hooks: D2Hooks, camera: Any, package: Mapping[str, Any]) -> Mapping[str, Any]:
         self._drawn += 1
@@ -253,21 +244,20 @@ class Session:
 
     def _watch(self, optimizer: torch.optim.Optimizer) -> None:
         """Run `D2Hooks.step` after the first zero_grad behind every step; on this instance alone."""
-        step, zero_grad, stepped = optimizer.step, optimizer.zero_grad, [False]
+        stepped = [False]
 
-        @wraps(step)
-        def stepping(*arguments: Any, **named: Any) -> Any:
+        def stepping(step: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
             stepped[0] = True
             return step(*arguments, **named)
 
-        @wraps(zero_grad)
-        def zeroing(*arguments: Any, **named: Any) -> None:
+        def zeroing(zero_grad: Callable[..., None], *arguments: Any, **named: Any) -> None:
             zero_grad(*arguments, **named)
             if stepped[0]:
                 stepped[0] = False
                 self._after_step()
 
-        optimizer.step, optimizer.zero_grad = stepping, zeroing  # type: ignore[method-assign]
+        wrap_attribute(optimizer, "step", stepping)
+        wrap_attribute(optimizer, "zero_grad", zeroing)
 
     def _after_step(self) -> None:
         if self.hooks is None:
@@ -283,6 +273,17 @@ class Session:
             made = f"made {done.others} Gaussians beside the {done.inserted} that D2 inserted"
             sentence = "iteration %d: the trainer's own densification has %s: set densify.max_gaussians"
             log.warning(sentence, done.last_step, made)
+
+
+def wrap_attribute(owner: Any, name: str, around: Callable[..., Any]) -> None:
+    """Replace a function of a module, class or object by `around`, which gets the original before the arguments."""
+    original = getattr(owner, name)
+
+    @wraps(original)
+    def wrapped(*arguments: Any, **named: Any) -> Any:
+        return around(original, *arguments, **named)
+
+    setattr(owner, name, wrapped)
 
 
 def attribute_of(module: str, attribute: str) -> Any:

@@ -80,7 +80,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _answer(words: list[str]) -> str | None:
-    """Run what the words say; returns what is left to print."""
     if words[:1] == ["--version"]:
         return f"d2-4dgs {__version__}"
     if sys.version_info[:2] < NEEDED:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from d2_plugin.commands.arguments.recording import show, show_notes
+from d2_plugin.commands.arguments.recording import show_notes
+from d2_plugin.progress import show
 from d2_plugin.recordings.importing.importing import import_videos
 from d2_plugin.recordings.importing.settings import ImportSettings
 

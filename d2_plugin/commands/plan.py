@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from d2_plugin.commands.arguments.form import Form, Given
-from d2_plugin.commands.arguments.recording import recording_form, run_settings, show, show_notes, show_plan
+from d2_plugin.commands.arguments.recording import recording_form, run_settings, show_notes, show_plan
+from d2_plugin.progress import show
 
 if TYPE_CHECKING:
     from d2_plugin.recordings import Recording

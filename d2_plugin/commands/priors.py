@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from d2_plugin.commands.arguments.form import Form, Given
-from d2_plugin.commands.arguments.recording import ConfigFile, recording_form, run_settings, show, show_notes, show_plan
+from d2_plugin.commands.arguments.recording import ConfigFile, recording_form, run_settings, show_notes, show_plan
 from d2_plugin.errors import D2Error
+from d2_plugin.progress import show
 from d2_plugin.settings import AtATime
 
 HELD_FRAMES = 8

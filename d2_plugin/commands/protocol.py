@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from d2_plugin.errors import D2Error, unknown_name
+from d2_plugin.errors import D2Error, refuse_unknown
 from d2_plugin.settings import AtATime, Count, Positional, Range, Seed, Settings
 
 
@@ -48,8 +48,7 @@ def run(settings: ProtocolRun) -> str:
     from d2_plugin.runs.tables import COLUMNS, markdown
     from d2_plugin.runs.training import bench
 
-    if settings.name not in PROTOCOLS:
-        raise unknown_name("protocol", settings.name, PROTOCOLS)
+    refuse_unknown("protocol", [settings.name], PROTOCOLS)
     protocol, path = PROTOCOLS[settings.name], str(settings.recording)
     if "@" in path:
         raise D2Error(f"{path} has an @ in its path, which parts a recording from its cameras: rename a folder")

@@ -11,12 +11,12 @@ from d2_plugin.commands.arguments.recording import (
     ConfigFile,
     recording_form,
     run_settings,
-    show,
     show_notes,
     show_plan,
     table_of_config,
 )
 from d2_plugin.errors import D2Error
+from d2_plugin.progress import show
 
 if TYPE_CHECKING:
     from d2_plugin.runs.run import Run
@@ -92,7 +92,6 @@ def _imported(given: Given, options: TrainOptions) -> Given:
 
 
 def _refuse_videos(path: Path) -> None:
-    """Say what a folder of nothing but videos needs."""
     from d2_plugin.recordings.importing.video import videos_below
     from d2_plugin.recordings.layouts import LAYOUTS
 

@@ -8,17 +8,12 @@ Splatting uses .0002 for the signed sum.
 
 from __future__ import annotations
 
-import functools
-import logging
-
 from torch import Tensor
 
 from d2_plugin.compat import inria
-from d2_plugin.compat.inria import GaussianRasterizationSettings
+from d2_plugin.compat.inria import GaussianRasterizationSettings, warn_once
 
 __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer"]
-
-log = logging.getLogger(__name__)
 
 
 class GaussianRasterizer(inria.GaussianRasterizer):
@@ -34,15 +29,10 @@ class GaussianRasterizer(inria.GaussianRasterizer):
     ) -> tuple[Tensor, ...]:
         """Color [3, H, W], radii [N] int32 and depth [1, H, W]."""
         if means2D_densify is not None:
-            _warn_of_signed_gradients()
+            warn_once(
+                "means2D_densify receives signed gradients, not sums of absolute ones: the trainer splits fewer "
+                "Gaussians, give it --densify_grad_threshold 0.0002"
+            )
             means2D = means2D + means2D_densify
         drawn = self._draw(means3D, means2D, opacities, **others)
         return drawn.color, drawn.radii, drawn.depth
-
-
-@functools.cache
-def _warn_of_signed_gradients() -> None:
-    log.warning(
-        "means2D_densify receives signed gradients, not sums of absolute ones: the trainer splits fewer Gaussians, "
-        "give it --densify_grad_threshold 0.0002"
-    )

@@ -75,7 +75,6 @@ class GaussianRasterizer(inria.GaussianRasterizer):
         shape: tuple[Tensor, Tensor | None, Tensor, Tensor | None],
         prefilter: float,
     ) -> Splats:
-        """The Gaussians that live at the settings' timestamp."""
         settings = self.raster_settings
         scales, scales_t, rotations, rotations_r = shape
         if settings.gaussian_dim != 4 and not settings.rot_4d:

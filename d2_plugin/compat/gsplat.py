@@ -104,7 +104,6 @@ def _refuse(render_mode: str, camera_model: str, others: dict[str, Any]) -> None
 
 
 def _in_front(means: Tensor, covariances: Tensor, opacities: Tensor, view: View, near: float, far: float) -> Splats:
-    """The Gaussians between the planes of one view."""
     forward = view.T_camera_world[2]
     depths = means.detach() @ forward[:3] + forward[3]
     rows = torch.nonzero((depths > near) & (depths < far)).squeeze(-1)

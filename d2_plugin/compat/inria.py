@@ -118,14 +118,15 @@ def view_of(settings: Any) -> View:
 def _compare_focal_lengths(settings: Any, focal_x: float, focal_y: float) -> None:
     focal = (0.5 * settings.image_width / settings.tanfovx, 0.5 * settings.image_height / settings.tanfovy)
     if abs(focal[0] - focal_x) > 1e-3 * focal_x or abs(focal[1] - focal_y) > 1e-3 * focal_y:
-        _warn_once(
+        warn_once(
             f"the field of view stands for focal lengths of {focal[0]:.1f} and {focal[1]:.1f} pixels but the "
             f"projection matrix has {focal_x:.1f} and {focal_y:.1f}, which are used for footprints, too"
         )
 
 
 @functools.cache
-def _warn_once(sentence: str) -> None:
+def warn_once(sentence: str) -> None:
+    """Log a warning, the same one only once."""
     log.warning("%s", sentence)
 
 

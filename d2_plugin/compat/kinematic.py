@@ -27,7 +27,6 @@ def quaternion_apply(quaternion: Tensor, point: Tensor) -> Tensor:
 
 
 def _product(a: Tensor, b: Tensor) -> Tensor:
-    """Hamilton's product."""
     scalar = a[..., :1] * b[..., :1] - (a[..., 1:] * b[..., 1:]).sum(-1, keepdim=True)
     crossed = torch.linalg.cross(*torch.broadcast_tensors(a[..., 1:], b[..., 1:]))
     return torch.cat([scalar, a[..., :1] * b[..., 1:] + b[..., :1] * a[..., 1:] + crossed], -1)

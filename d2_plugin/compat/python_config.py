@@ -34,7 +34,6 @@ class Config(dict):
 
 
 def _over(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
-    """`above` over `below`, table by table."""
     merged = dict(below)
     for name, value in above.items():
         inner = merged.get(name)

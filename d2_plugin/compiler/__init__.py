@@ -81,7 +81,6 @@ def find_compiler() -> list[str]:
 
 
 def _words(variable: str, text: str) -> list[str]:
-    """The words of an environment variable, as a shell reads them."""
     try:
         return shlex.split(text)
     except ValueError as error:
@@ -104,7 +103,7 @@ def load_library(
     """
     prebuilt = find_prebuilt(name, sources, headers, flags)
     if prebuilt is not None:
-        return _opened(prebuilt)
+        return ctypes.CDLL(str(prebuilt))
     compiler = find_compiler()
     command = [*compiler, *_flags(compiler, (*sources, *headers), flags)]
     key = _key(_predefined(tuple(command)), sources, headers, flags)
@@ -113,13 +112,6 @@ def load_library(
         if library not in _loaded:
             check_private(library.parent)
             _loaded[library] = _open(library) or _build(library, command, sources)
-        return _loaded[library]
-
-
-def _opened(library: Path) -> ctypes.CDLL:
-    with _guard:
-        if library not in _loaded:
-            _loaded[library] = ctypes.CDLL(str(library))
         return _loaded[library]
 
 

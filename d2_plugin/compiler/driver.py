@@ -92,7 +92,6 @@ class Driver:
             self._check(self._driver.cuLaunchKernel(function, *grid, 1, threads, 1, 1, 0, stream, parameters, None))
 
     def _primary_context(self) -> ctypes.c_void_p:
-        """The context that torch works in."""
         torch.cuda.init()
         index, context = ctypes.c_int(), ctypes.c_void_p()
         self._check(self._driver.cuDeviceGet(ctypes.byref(index), self.device.index))

@@ -122,14 +122,8 @@ class Nvrtc:
             raise D2Error(f"NVRTC says {self._library.nvrtcGetErrorString(result).decode()}: please report this")
 
 
-@functools.cache
-def library() -> Nvrtc:
-    """The NVRTC library, loaded once.
-
-    Raises:
-        NoCuda: there is none.
-    """
-    return Nvrtc()
+library = functools.cache(Nvrtc)
+"""The NVRTC library, loaded once."""
 
 
 def build(name: str, code: Program, flags: Sequence[str], capability: int) -> Binary:

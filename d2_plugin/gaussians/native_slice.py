@@ -30,7 +30,6 @@ STATIC = {"positions": 3, "log_scales": 3, "left": 4, "opacity_logits": 1}
 """Columns of the raw parameters of a model without time, in the order of `_Slice.apply`."""
 TEMPORAL = {**STATIC, "times": 1, "log_time_scales": 1, "right": 4}
 
-
 _Call = structure(
     "long count drawn",
     "float time marginal_cut log_scale_limit small_norm",

@@ -110,8 +110,6 @@ def _build_frame(sources: _Sources, store: PriorStore, number: int) -> Iterator[
 
 @dataclass(frozen=True, eq=False)
 class _Sources:
-    """What the priors of a recording are made of."""
-
     recording: Recording
     cameras: Mapping[str, Camera]
     wanted: PriorSettings
@@ -158,7 +156,6 @@ class _Sources:
 
     @property
     def kind(self) -> MonoKind | None:
-        """What the monocular maps are; None where there are none."""
         return None if self.mono is None else self.mono.kind
 
     @property
@@ -168,7 +165,6 @@ class _Sources:
         return compares_cameras(self.settings, len(self.cameras), measured)
 
     def views(self, frame: Frame, names: Sequence[str]) -> dict[str, ViewSources]:
-        """Both depths of the views of one frame."""
         depths = {} if self.geometric is None else self.geometric.depths(frame)
         several = {} if self.multiview is None else self.multiview.views(frame)
         return {
@@ -212,7 +208,6 @@ class _Sources:
         return {name: hash_of(*common, maps.get(name)) for name in self.cameras}
 
     def _mono_key(self, name: str, frame: Frame) -> str:
-        """Hash of a monocular map and of its confidence."""
         confidence = self.confidence.of(self.cameras[name], frame.number)
         key = "none" if self.mono is None else self.mono.key(name, frame)
         return key if confidence is None else hash_of(key, digest(confidence))
@@ -302,7 +297,6 @@ def _recorded(store: PriorStore, name: str, number: int) -> dict[str, Any] | Non
 
 
 def _chosen_bounds(settings: PriorSettings) -> DepthBounds | None:
-    """The depth range of the settings, None where they leave it open."""
     return None if settings.depth_range is None else DepthBounds(*settings.depth_range, "setting depth_range")
 
 

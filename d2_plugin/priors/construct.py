@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from d2_plugin.priors.evidence import AT_BEST, with_evidence
-from d2_plugin.priors.fuse import FusedPrior, empty_prior, fuse, hanging_pixels
+from d2_plugin.priors.fuse import fuse, hanging_pixels
 from d2_plugin.priors.maps_on_disk import divided, planar
 from d2_plugin.priors.monocular.across import Shown, aligned_across
 from d2_plugin.priors.monocular.align import (
@@ -33,6 +33,7 @@ from d2_plugin.priors.settings import PriorSettings
 from d2_plugin.priors.stereo.filtering.filter import GeometricDepth
 from d2_plugin.protocol import Label
 from d2_plugin.recordings.recording import Camera, MonoKind
+from d2_plugin.store.maps import FusedPrior, empty_prior
 
 CONSTRUCTION_VERSION = 15  # raise it when alignment or fusion change what they return
 
@@ -220,7 +221,6 @@ class _AlignedMap:
 
     @property
     def skill(self) -> Skill | None:
-        """What left-out anchors show of it."""
         return None if self.uncertainty is None else self.uncertainty.skill
 
 

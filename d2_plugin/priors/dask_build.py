@@ -16,7 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from d2_plugin.errors import D2Error, missing_extra
+from d2_plugin.errors import D2Error
+from d2_plugin.extras import imported
 from d2_plugin.priors.build import Progress, build_priors
 from d2_plugin.priors.settings import PriorSettings
 from d2_plugin.priors.stereo.matched_depth import frame_blocks
@@ -98,13 +99,10 @@ def cluster_client(scheduler: str | None, workers: int, purpose: str = "building
 
     `purpose` completes the sentence "<purpose> needs dask.distributed".
     """
-    try:
-        from distributed import Client, LocalCluster
-    except ImportError:
-        raise missing_extra("dask.distributed", "cluster", purpose) from None
+    distributed = imported("distributed", "dask.distributed", "cluster", purpose)
     if scheduler is not None:
         try:
-            client = Client(scheduler, timeout="10s", set_as_default=False)
+            client = distributed.Client(scheduler, timeout="10s", set_as_default=False)
         except (OSError, TimeoutError, ValueError) as error:
             raise D2Error(
                 f"no dask scheduler answers at {scheduler} ({error}): start one with `dask scheduler`, or leave the "
@@ -118,13 +116,13 @@ def cluster_client(scheduler: str | None, workers: int, purpose: str = "building
     if workers < 1:
         raise D2Error(f"{workers} workers cannot build anything: give at least 1")
     with (
-        LocalCluster(
+        distributed.LocalCluster(
             n_workers=workers,
             threads_per_worker=1,  # frames are independent: processes of one thread waste nothing
             processes=True,
             dashboard_address=":0",
             silence_logs=logging.ERROR,
         ) as cluster,
-        Client(cluster, set_as_default=False) as client,
+        distributed.Client(cluster, set_as_default=False) as client,
     ):
         yield client

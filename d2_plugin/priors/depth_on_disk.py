@@ -9,6 +9,7 @@ Workspaces are read by `d2_plugin.priors.colmap.workspace`.
 
 from __future__ import annotations
 
+import functools
 import itertools
 from collections.abc import Sequence
 from dataclasses import replace
@@ -27,7 +28,7 @@ from d2_plugin.priors.stereo.filtering.filter import GeometricDepth, filter_dept
 from d2_plugin.priors.stereo.geometric_depth import gray
 from d2_plugin.priors.stereo.settings import StereoSettings
 from d2_plugin.reading import read_json
-from d2_plugin.recordings.files import FrameFiles, numbered_files
+from d2_plugin.recordings.files import files_by_camera
 from d2_plugin.recordings.recording import Camera, Recording
 from d2_plugin.values import shown
 
@@ -57,9 +58,7 @@ class SensorDepth:
 
     def __init__(self, folder: Path, cameras: Sequence[str]) -> None:
         self.scale, self.along_ray = _meaning(folder / "depth.json")
-        self.files: dict[str, FrameFiles] = {
-            name: numbered_files(folder / name, SUFFIXES) for name in cameras if (folder / name).is_dir()
-        }
+        self.files = files_by_camera(folder, cameras, SUFFIXES)
         self.about = f"sensor depth of {', '.join(self.files) or 'no camera'} in {folder.name}/"
 
     def depth(self, camera: Camera, frame: int) -> np.ndarray | None:
@@ -136,16 +135,14 @@ class DepthOnDisk(GeometricSource):
     ) -> None:
         super().__init__(cameras, bounds, settings, maps.name, cache / "stereo")
         self.maps, self.confidence = maps, ConfidenceMaps(Path(), ()) if confidence is None else confidence
-        self._last: tuple[int | None, list[np.ndarray]] = None, []
+        self._read = functools.lru_cache(maxsize=1)(self._maps)
 
     def _inputs(self, frame: Frame) -> list[list[str | None]]:
-        """Hashes of the maps and of their confidence."""
         confidences = [self.confidence.of(camera, frame.number) for camera in self.cameras]
         hashes = [None if map_ is None else digest(map_) for map_ in confidences]
         return [[digest(depth) for depth in self._read(frame.number)], hashes]
 
     def _computed(self, frame: Frame) -> list[GeometricDepth]:
-        """D^g per camera at one frame."""
         confidences = [self.confidence.of(camera, frame.number) for camera in self.cameras]
         known = [True if values is None else values > 0 for values in confidences]
         maps = [np.where(where, depth, np.float32(0)) for where, depth in zip(known, self._read(frame.number))]
@@ -157,14 +154,12 @@ class DepthOnDisk(GeometricSource):
             filtered = filter_depths(grays, self.cameras, maps, costs, self.settings)
         return [replace(depth, sigma=divided(depth.sigma, c)) for depth, c in zip(filtered, confidences)]
 
-    def _read(self, number: int) -> list[np.ndarray]:
-        """The maps of one frame, float32 [H, W] per camera, 0 where unknown or out of range; the last are kept."""
-        if self._last[0] != number:
-            near, far = (0.0, np.inf) if self.bounds is None else self.bounds[:2]
-            read = [(camera, self.maps.depth(camera, number)) for camera in self.cameras]
-            whole = [np.zeros((c.height, c.width), np.float32) if depth is None else depth for c, depth in read]
-            self._last = number, [np.where((d >= near) & (d <= far), d, np.float32(0)) for d in whole]
-        return self._last[1]
+    def _maps(self, number: int) -> list[np.ndarray]:
+        """The maps of one frame, float32 [H, W] per camera, 0 where unknown or out of range."""
+        near, far = (0.0, np.inf) if self.bounds is None else self.bounds[:2]
+        read = [(camera, self.maps.depth(camera, number)) for camera in self.cameras]
+        whole = [np.zeros((c.height, c.width), np.float32) if depth is None else depth for c, depth in read]
+        return [np.where((d >= near) & (d <= far), d, np.float32(0)) for d in whole]
 
 
 def filter_sensor(depth: np.ndarray, settings: StereoSettings) -> GeometricDepth:

@@ -19,9 +19,9 @@ from dataclasses import replace
 import numpy as np
 
 from d2_plugin.priors.cross_view.kernel import View, compare_views
-from d2_plugin.priors.fuse import FusedPrior
 from d2_plugin.recordings.images import opencv
 from d2_plugin.recordings.recording import Camera
+from d2_plugin.store.maps import FusedPrior
 
 AGREED = 0.57
 """Factor of sigma where another camera's monocular depth agrees and the colours are alike. What a heavy tail added to

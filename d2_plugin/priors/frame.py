@@ -34,12 +34,7 @@ class Frame:
 
 def describe_camera(camera: Camera) -> dict[str, Any]:
     """Name, size, K and pose as plain values, for records and hashes."""
-    return {
-        "name": camera.name,
-        "size": [camera.width, camera.height],
-        "K": np.asarray(camera.K, float).tolist(),
-        "T_camera_world": np.asarray(camera.T_camera_world, float).tolist(),
-    }
+    return {"name": camera.name, **camera.calibration()}
 
 
 def describe_recording(recording: Recording) -> dict[str, Any]:

@@ -10,17 +10,7 @@ from d2_plugin.errors import D2Error, refuse_unknown
 from d2_plugin.priors.settings import Variant
 from d2_plugin.protocol import Label
 from d2_plugin.recordings.images import opencv
-from d2_plugin.store.maps import FusedPrior, empty_prior
-
-__all__ = [
-    "VARIANTS",
-    "FusedPrior",
-    "cross_source_discrepancy",
-    "empty_prior",
-    "fuse",
-    "hanging_pixels",
-    "verified_region",
-]
+from d2_plugin.store.maps import FusedPrior
 
 VARIANTS: tuple[Variant, ...] = get_args(Variant)
 

@@ -10,7 +10,7 @@ import numpy as np
 from d2_plugin.arrays import read_array
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.geometry import viewing_rays
-from d2_plugin.recordings.files import FrameFiles, numbered_files
+from d2_plugin.recordings.files import files_by_camera
 from d2_plugin.recordings.images import opencv, read_numbers, shrink_depth
 from d2_plugin.recordings.recording import Camera
 
@@ -79,9 +79,7 @@ class ConfidenceMaps:
     """
 
     def __init__(self, folder: Path, cameras: Sequence[str]) -> None:
-        self.files: dict[str, FrameFiles] = {
-            name: numbered_files(folder / name, SUFFIXES) for name in cameras if (folder / name).is_dir()
-        }
+        self.files = files_by_camera(folder, cameras, SUFFIXES)
 
     @classmethod
     def beside(cls, recording_folder: Path | None, name: str, cameras: Sequence[str]) -> ConfidenceMaps:

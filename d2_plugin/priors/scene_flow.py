@@ -150,7 +150,6 @@ def _components(mask: np.ndarray, least: int) -> Iterator[np.ndarray]:
 
 
 def _small(*maps: np.ndarray) -> list[np.ndarray]:
-    """The maps about `FINE_WIDTH` wide, float32."""
     cv2, factor = opencv("scene flow"), max(1, round(maps[0].shape[1] / FINE_WIDTH))
     size = [length // factor for length in maps[0].shape[1::-1]]
     return [cv2.resize(map_.astype(np.float32), size, interpolation=cv2.INTER_AREA) for map_ in maps]

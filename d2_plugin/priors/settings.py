@@ -28,10 +28,8 @@ verified, since the paper runs "identical densification, pruning, and RGB-D opti
 Preprocessing = Literal["auto", "depth_anything_v2", "unit"]
 """How an image becomes a network's input."""
 
-
 Along = Literal["z", "ray"]
 """What a stored depth is measured along."""
-
 
 MultiviewScale = Literal["shared", "view", "metric"]
 """What the depth of a multi-view network is known up to."""
@@ -106,9 +104,5 @@ class PriorSettings(Settings):
 
     @classmethod
     def from_dict(cls, table: Mapping[str, Any], where: str = "priors") -> PriorSettings:
-        """From a table as TOML gives it, with the tables `stereo` and `align` inside; what is absent keeps its default.
-
-        Raises:
-            D2Error: an unknown name, with the nearest one suggested, or a value of the wrong type or out of range.
-        """
+        """See `Settings.from_dict`; the tables `stereo` and `align` stand inside."""
         return super().from_dict(table, where)

@@ -34,7 +34,6 @@ CACHED_CHANNELS = 3
 MOST_PAIRS = 2**31 - 1
 """Slots are 32-bit integers."""
 
-
 THREADS, TILE, GATHERERS, WARP, MOMENTS, STATISTICS = 256, 16, 8, 32, 7, 4
 """As in gpu.cu: threads of a block, pixels along a side of a tile, and the sizes of what is gathered."""
 
@@ -81,7 +80,7 @@ class Launcher:
     """Launches the kernels of gpu.cu on one CUDA device, on torch's current stream."""
 
     def __init__(self, device: torch.device) -> None:
-        """Compile (or find) the kernels for `device`, as `Driver` does."""
+        """Compile (or find) the kernels for `device`, with the errors of `Driver`."""
         self._driver = Driver(device, lambda *variant: binary_for(*variant), CACHED_CHANNELS)
 
     def launch(self, kernel: str, blocks: int, frame: Frame, rows: int = 1) -> None:
@@ -92,14 +91,8 @@ class Launcher:
         self._driver.launch(kernel, frame.channels or CACHED_CHANNELS, (blocks, rows), THREADS, frame)
 
 
-@functools.cache
-def launcher(device: torch.device) -> Launcher:
-    """The launcher of a CUDA device; `device` has an index.
-
-    Raises:
-        NoCuda: no driver, no NVRTC, or an architecture that it does not know.
-    """
-    return Launcher(device)
+launcher = functools.cache(Launcher)
+"""The one `Launcher` of a CUDA device with an index."""
 
 
 @functools.cache

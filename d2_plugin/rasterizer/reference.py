@@ -31,7 +31,6 @@ VARIANCE_FLOOR = 1e-8
 LEAST_EDGE = 1e-30
 """A near edge that is not beyond this counts as unknown; its inverse would not be finite in float32."""
 
-
 LEAST_AREA = 2.5e-5
 """Least share of its own area in its blurred area that a Gaussian is taken to have, as Mip-Splatting's code does: an
 edge-on Gaussian has none, and the logarithm no derivative there."""

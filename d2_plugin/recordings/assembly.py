@@ -20,7 +20,7 @@ from d2_plugin.errors import D2Error
 from d2_plugin.reading import read_json
 from d2_plugin.recordings.cameras.camera import CalibratedCamera
 from d2_plugin.recordings.cameras.undistort import UndistortedSource, refuse_black
-from d2_plugin.recordings.files import FrameFiles, numbered_files
+from d2_plugin.recordings.files import FrameFiles, files_by_camera
 from d2_plugin.recordings.images import MASK_FOLDERS, VALID_FOLDER, read_image, read_mask
 from d2_plugin.recordings.recording import MonoKind, Recording, Source
 from d2_plugin.values import shown
@@ -84,11 +84,12 @@ def assembled(
     """
     pinholes = {name: camera.pinhole(where) for name, camera in cameras.items()}
     kind, emulated = _mono_description(path)
-    monos = _maps(path / "mono", cameras, ".npy")
+    monos = files_by_camera(path / "mono", cameras, (".npy",))
     masks, mask_notes = _masks(path, cameras)
     valid = {name: path / VALID_FOLDER / f"{name}.png" for name in cameras}
     valid = {name: file for name, file in valid.items() if file.is_file()}
-    source: Source = FolderSource(images, _maps(path / "depth", cameras, ".npz"), monos, masks, valid)
+    depths = files_by_camera(path / "depth", cameras, (".npz",))
+    source: Source = FolderSource(images, depths, monos, masks, valid)
     bent = {name: camera for name, camera in cameras.items() if camera.lens.bends}
     if bent:
         source = UndistortedSource(source, bent)
@@ -122,21 +123,14 @@ def _lens_notes(bent: Mapping[str, CalibratedCamera]) -> tuple[str, ...]:
 def _masks(path: Path, names: Iterable[str]) -> tuple[dict[str, FrameFiles], tuple[str, ...]]:
     """(foreground masks that lie beside the images, a note that says which)."""
     for folder in MASK_FOLDERS:
-        masks = {name: files for name, files in _maps(path / folder, names, None).items() if files}
+        masks = {name: files for name, files in files_by_camera(path / folder, names).items() if files}
         if masks:
             some = "" if masks.keys() == set(names) else f" of {', '.join(masks)}"
             return masks, (f"foreground masks{some} from {folder}",)
     return {}, ()
 
 
-def _maps(folder: Path, names: Iterable[str], suffix: str | None) -> dict[str, FrameFiles]:
-    """The files of each camera that has some in `folder`; images where there is no suffix."""
-    there = [name for name in names if (folder / name).is_dir()]
-    return {name: numbered_files(folder / name, *([(suffix,)] if suffix else [])) for name in there}
-
-
 def _mono_description(path: Path) -> tuple[MonoKind, bool]:
-    """(kind, emulated) of the maps in mono/."""
     declared = path / "mono" / "mono.json"
     content = read_json(declared, CORRECT) if declared.exists() else {}
     kind, emulated = content.get("kind", "relative"), content.get("emulated", False)

@@ -53,6 +53,13 @@ def numbered_files(folder: Path, suffixes: Iterable[str] = IMAGE_SUFFIXES) -> Fr
     return files
 
 
+def files_by_camera(
+    folder: Path, cameras: Iterable[str], suffixes: Iterable[str] = IMAGE_SUFFIXES
+) -> dict[str, FrameFiles]:
+    """`numbered_files` of each camera that has a folder of its name in `folder`."""
+    return {name: numbered_files(folder / name, suffixes) for name in cameras if (folder / name).is_dir()}
+
+
 def frame_number(digits: str, path: Path | str) -> int:
     """The frame that digits in the name of an image say."""
     if len(digits) > MOST_DIGITS:

@@ -10,7 +10,8 @@ from types import ModuleType
 import numpy as np
 
 from d2_plugin.durable import write
-from d2_plugin.errors import D2Error, missing_extra
+from d2_plugin.errors import D2Error
+from d2_plugin.extras import imported
 from d2_plugin.reading import opened, parsing, read_bytes, shown_path
 from d2_plugin.values import shown
 
@@ -37,11 +38,7 @@ def opencv(purpose: str, extra: str = "image") -> ModuleType:
     Raises:
         MissingExtra: where it is not installed; the sentence names `extra`, the extra of this package that brings it.
     """
-    try:
-        import cv2
-    except ImportError:
-        raise missing_extra("OpenCV", extra, purpose) from None
-    return cv2
+    return imported("cv2", "OpenCV", extra, purpose)
 
 
 def read_image(path: Path) -> np.ndarray:
@@ -167,7 +164,6 @@ def _decoded(path: Path, encoded: bytes, flags: int) -> np.ndarray:
 
 
 def _size(path: Path, data: bytes) -> tuple[int, int]:
-    """(width, height) in the header of an image."""
     if data.startswith(_PNG_SIGNATURE) and len(data) >= 24:
         width, height = struct.unpack(">II", data[16:24])
     elif data.startswith(b"\xff\xd8"):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -29,6 +29,11 @@ class Camera:
     def centre(self) -> np.ndarray:
         """Camera centre in the world, [3]."""
         return -self.T_camera_world[:3, :3].T @ self.T_camera_world[:3, 3]
+
+    def calibration(self) -> dict[str, Any]:
+        """Size, K and pose as plain values, by which a prior store knows its recording again."""
+        K, pose = (np.asarray(matrix, float).tolist() for matrix in (self.K, self.T_camera_world))
+        return {"size": [self.width, self.height], "K": K, "T_camera_world": pose}
 
 
 class Exposure(NamedTuple):

@@ -47,11 +47,14 @@ def renderer(model: Any, recording: Recording, device: torch.device | str) -> Re
     def render(camera: str, frame: int) -> tuple[Tensor, Tensor]:
         view = make_view(recording, camera, frame, device)
         color, depth_sum, alpha = (part.cpu() for part in model.render(view)[:3])
-        solid = alpha > RENDERED_ALPHA
-        depth = torch.where(solid, depth_sum / alpha.clamp(min=RENDERED_ALPHA), torch.zeros_like(alpha))
-        return color.clamp(0, 1), depth
+        return color.clamp(0, 1), rendered_depth(depth_sum, alpha)
 
     return render
+
+
+def rendered_depth(depth_sum: Tensor, alpha: Tensor) -> Tensor:
+    """Mean depth [H, W], 0 where too little is opaque."""
+    return torch.where(alpha > RENDERED_ALPHA, depth_sum / alpha.clamp(min=RENDERED_ALPHA), torch.zeros_like(alpha))
 
 
 def evaluate_scene(model: Any, scene: Scene, device: torch.device | str, images: Path | None = None) -> dict[str, Any]:
@@ -184,7 +187,6 @@ def _checked(
 
 
 def _means(rows: Sequence[dict[str, Any]]) -> dict[str, float | None]:
-    """The mean of each metric over the rows that have it."""
     return {name: _mean(row[name] for row in rows) for name in metrics.VARIANTS}
 
 

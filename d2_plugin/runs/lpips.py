@@ -69,7 +69,6 @@ class Lpips:
         return sum(((a - b).square() * w[:, None, None]).sum(0).mean().item() for a, b, w in pairs)
 
     def _features(self, image: Tensor) -> Iterator[Tensor]:
-        """Features [C, h, w] of unit length per pixel, layer by layer."""
         values = ((image.float().cpu() - torch.tensor(SHIFT)) / torch.tensor(SCALE)).permute(2, 0, 1)[None]
         for number, layer in enumerate(self.layers):
             values = layer(values)

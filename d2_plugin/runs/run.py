@@ -187,7 +187,6 @@ class Run:
         return Path(self.settings.priors or self.folder / "priors")
 
     def _points(self) -> TimedPoints:
-        """The triangulated points, kept in points.npz."""
         path = self.folder / "points.npz"
         if not path.is_file():
             triangulated_points(self.scene.recording, self.scene.train_cameras).save(path)

@@ -80,8 +80,7 @@ def _guarded(name: str, sentences: Iterator[str]) -> list[str]:
 
 
 def _missing_members(example: Example) -> Iterator[str]:
-    members = ("__len__", "view", "slice_at", "insert", "remove", "on_resize")
-    for name in members:
+    for name in ("__len__", "view", "slice_at", "insert", "remove", "on_resize"):
         if not callable(getattr(example.backbone, name, None)):
             yield f"the backbone has no {name}(): see d2_plugin.protocol.Backbone"
     if not isinstance(getattr(example.backbone, "settings", None), RasterSettings):

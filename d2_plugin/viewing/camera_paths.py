@@ -24,8 +24,10 @@ from d2_plugin.recordings.cameras.camera import (
     LARGEST_SIDE,
     OPENGL_TO_OPENCV,
     checked_camera,
+    look_at,
     pinhole,
     rigid,
+    unit,
 )
 from d2_plugin.recordings.cameras.rotations import quaternion_of_rotation, rotation_of_quaternion, rotation_of_vector
 from d2_plugin.values import Range
@@ -82,17 +84,6 @@ def orbit(
     return [at_pose(cameras[0], look_at(rig.focus + offset, rig.focus, rig.up)) for offset in around]
 
 
-def look_at(position: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """T_camera_world [4, 4] of a camera at `position` that looks at `target`, upright."""
-    forward = _unit(target - position)
-    right = np.cross(forward, up)
-    if np.linalg.norm(right) < 1e-9:  # straight up or down: any side will do
-        right = np.cross(forward, np.roll(up, 1))
-    right = _unit(right)
-    R = np.stack([right, np.cross(forward, right), forward])
-    return rigid(R, -R @ position)
-
-
 class Rig(NamedTuple):
     """What cameras have in common."""
 
@@ -106,13 +97,13 @@ class Rig(NamedTuple):
         """Of one camera or more; `depth` is that of what they look at, where their axes do not meet."""
         centres = np.stack([camera.centre for camera in cameras])
         forwards = np.stack([camera.T_camera_world[2, :3] for camera in cameras])
-        up = _unit(-np.mean([camera.T_camera_world[1, :3] for camera in cameras], axis=0))
+        up = unit(-np.mean([camera.T_camera_world[1, :3] for camera in cameras], axis=0))
         focus = focus_of(centres, forwards, depth)
         offsets = centres - focus
         flat = offsets - np.outer(offsets @ up, up)
         azimuth, span = _arc(flat, up)
         radius, height = np.linalg.norm(flat, axis=1).mean(), (offsets @ up).mean()
-        towards = rotation_of_vector(np.radians(azimuth) * up) @ _unit(flat[0])
+        towards = rotation_of_vector(np.radians(azimuth) * up) @ unit(flat[0])
         return cls(focus, focus + radius * towards + height * up, up, span)
 
     @property
@@ -124,7 +115,7 @@ class Rig(NamedTuple):
         """Ends of where cameras stood, with a margin: azimuth about `up` (radians, 0 at home; None where they stand all
         around), elevation (radians) and distance from the focus."""
         offsets, home = np.stack([camera.centre for camera in cameras]) - self.focus, self.middle - self.focus
-        ahead = _unit(home - (home @ self.up) * self.up)
+        ahead = unit(home - (home @ self.up) * self.up)
         azimuth = np.arctan2(offsets @ np.cross(self.up, ahead), offsets @ ahead)
         distance = np.linalg.norm(offsets, axis=1)
         elevation = np.arcsin(np.clip(offsets @ self.up / distance, -1, 1))
@@ -147,7 +138,7 @@ def focus_of(centres: np.ndarray, forwards: np.ndarray, depth: float | None = No
             return point
     spread = np.linalg.norm(centres - centres.mean(axis=0), axis=1).max()
     far = depth if depth is not None else max(4 * spread, 1.0)
-    return centres.mean(axis=0) + far * _unit(forwards.mean(axis=0))
+    return centres.mean(axis=0) + far * unit(forwards.mean(axis=0))
 
 
 def _arc(flat: np.ndarray, up: np.ndarray) -> tuple[float, float]:
@@ -155,7 +146,7 @@ def _arc(flat: np.ndarray, up: np.ndarray) -> tuple[float, float]:
 
     It is the circle without the widest gap between two neighbours.
     """
-    ahead = _unit(flat[0])
+    ahead = unit(flat[0])
     angles = np.sort(np.degrees(np.arctan2(flat @ np.cross(up, ahead), flat @ ahead)))
     gaps = np.diff(angles, append=angles[0] + 360)
     begin = int(gaps.argmax()) + 1
@@ -178,10 +169,6 @@ def between(chain: Sequence[Camera], place: float) -> Camera:
     R = rotation_of_quaternion(weights[0] * p + weights[1] * q)
     K = (1 - share) * a.K + share * for_size(b, a.width, a.height).K
     return replace(at_pose(a, rigid(R, -R @ ((1 - share) * a.centre + share * b.centre))), K=K)
-
-
-def _unit(vector: np.ndarray) -> np.ndarray:
-    return vector / max(np.linalg.norm(vector), 1e-12)
 
 
 class CameraPath(NamedTuple):

@@ -14,9 +14,8 @@ from torch import Tensor
 
 from d2_plugin.protocol import Splats, View, call_optional
 from d2_plugin.rasterizer import rasterize
+from d2_plugin.runs.evaluation import rendered_depth
 
-SOLID = 0.5
-"""A rendered depth is shown where the accumulated alpha exceeds this."""
 GREY = 0.6
 """Brightness of Gaussians whose adapter knows no colours."""
 MARKED = (1.0, 0.45, 0.0)
@@ -52,5 +51,4 @@ def render_view(backbone: Any, view: View, marked: Tensor | None = None, scale: 
     if marked is None:
         render = call_optional(backbone, "behind", render, view, default=render)
     color, depth_sum, alpha = (part.cpu() for part in render[:3])
-    depth = torch.where(alpha > SOLID, depth_sum / alpha.clamp(min=SOLID), torch.zeros_like(alpha))
-    return RenderedView(color.clamp(0, 1), depth, alpha, splats)
+    return RenderedView(color.clamp(0, 1), rendered_depth(depth_sum, alpha), alpha, splats)

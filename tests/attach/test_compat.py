@@ -99,7 +99,7 @@ class TestThreeDGS:
         values = gaussians()
         right = inria.GaussianRasterizer(inria.GaussianRasterizationSettings(**camera))(**values)[0]
         broken = {**camera, "tanfovx": math.tan(-0.5), "tanfovy": math.tan(-0.5)}
-        inria._warn_once.cache_clear()
+        inria.warn_once.cache_clear()
         with caplog.at_level(logging.WARNING):
             result = inria.GaussianRasterizer(inria.GaussianRasterizationSettings(**broken))(**values)[0]
         torch.testing.assert_close(result, right, atol=0, rtol=0)
@@ -128,7 +128,7 @@ class TestDepth:
 
     def test_the_gradient_for_densification_is_the_signed_one_and_the_log_says_so(self, camera: dict, caplog) -> None:
         """means2D_densify of Deformable-3D-Gaussians, which sums absolute values in the original."""
-        depth._warn_of_signed_gradients.cache_clear()
+        inria.warn_once.cache_clear()
         raster, values = depth.GaussianRasterizer(depth.GaussianRasterizationSettings(**camera)), gaussians()
         densify = torch.zeros_like(values["means2D"]).requires_grad_()
         color, *_ = raster(**values, means2D_densify=densify)

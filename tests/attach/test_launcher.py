@@ -131,8 +131,7 @@ def test_stages_of_4dgaussians_reach_the_adapter() -> None:
     def render(camera: object, model: object, stage: str) -> dict:
         return {"render": gaussians._xyz.sum() * torch.ones(3, 2, 2)}
 
-    rendering = session._rendering(render)
-    rendering(scene.getTrainCameras()[0], gaussians, stage="fine")
+    session._rendering(render, scene.getTrainCameras()[0], gaussians, stage="fine")
     assert session.hooks.backbone.stage == "fine"
     assert session.hooks.backbone.active(1)
 

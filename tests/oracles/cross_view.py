@@ -31,10 +31,10 @@ from d2_plugin.priors.cross_view.kernel import (
     View,
 )
 from d2_plugin.priors.evidence import AGREED, ALONE, AT_BEST, view_of
-from d2_plugin.priors.fuse import FusedPrior
 from d2_plugin.priors.geometry import ViewPair, view_pair
 from d2_plugin.protocol import Label
 from d2_plugin.recordings.recording import Camera
+from d2_plugin.store.maps import FusedPrior
 from oracles.stereo_filter import interpolated_surface
 
 

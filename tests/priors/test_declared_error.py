@@ -12,13 +12,13 @@ from prior_cases import showing
 
 from d2_plugin.priors.build import build_priors
 from d2_plugin.priors.declared_error import DeclaredErrors, held_against_truth, truth_rounding
-from d2_plugin.priors.fuse import FusedPrior
 from d2_plugin.priors.settings import PriorSettings
 from d2_plugin.priors.summary import PriorSummary
 from d2_plugin.protocol import Label
 from d2_plugin.recordings import open_recording
 from d2_plugin.recordings.recording import Recording
 from d2_plugin.recordings.synthetic.room import synthetic_recording
+from d2_plugin.store.maps import FusedPrior
 from d2_plugin.store.store import PriorStore
 
 pytest.importorskip("cv2")

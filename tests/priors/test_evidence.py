@@ -12,10 +12,10 @@ from prior_cases import camera_at, plane_seen_by
 from d2_plugin.priors.build import build_priors
 from d2_plugin.priors.cross_view.kernel import BESIDE, LIKE, NEAR, WITHIN
 from d2_plugin.priors.evidence import AGREED, ALONE, AT_BEST, with_evidence
-from d2_plugin.priors.fuse import FusedPrior
 from d2_plugin.priors.settings import PriorSettings
 from d2_plugin.protocol import Label
 from d2_plugin.recordings.synthetic.room import synthetic_recording
+from d2_plugin.store.maps import FusedPrior
 from d2_plugin.store.store import PriorStore
 
 pytest.importorskip("cv2")

@@ -18,7 +18,6 @@ from d2_plugin.compiler import NoCompiler, find_compiler
 from d2_plugin.errors import D2Error
 from d2_plugin.priors import build
 from d2_plugin.priors.evidence import with_evidence
-from d2_plugin.priors.fuse import FusedPrior
 from d2_plugin.priors.stereo.filtering import confirm, kernel, precision
 from d2_plugin.priors.stereo.filtering.filter import surface_coherence
 from d2_plugin.priors.stereo.geometric_depth import gray
@@ -27,6 +26,7 @@ from d2_plugin.protocol import Label
 from d2_plugin.recordings import open_recording
 from d2_plugin.recordings.recording import Camera
 from d2_plugin.recordings.synthetic.room import synthetic_recording
+from d2_plugin.store.maps import FusedPrior
 
 pytest.importorskip("cv2")
 try:

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from d2_plugin.errors import D2Error
-from d2_plugin.priors.fuse import FusedPrior
 from d2_plugin.priors.sheet import LABEL_COLORS, UNKNOWN, contact_sheet, depth_colors, sigma_colors
 from d2_plugin.protocol import Label
 from d2_plugin.recordings.synthetic.room import synthetic_recording
+from d2_plugin.store.maps import FusedPrior
 from d2_plugin.store.store import PriorStore
 
 cv2 = pytest.importorskip("cv2")

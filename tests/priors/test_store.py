@@ -16,12 +16,11 @@ from prior_cases import contents
 
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.build import PriorSettings, PriorSummary, build_priors
-from d2_plugin.priors.fuse import FusedPrior
 from d2_plugin.priors.settings import StereoSettings
 from d2_plugin.protocol import Label
 from d2_plugin.recordings.recording import Recording
 from d2_plugin.recordings.synthetic.room import synthetic_recording
-from d2_plugin.store.maps import SIGMA, DepthRange, encode_sigma
+from d2_plugin.store.maps import SIGMA, DepthRange, FusedPrior, encode_sigma
 from d2_plugin.store.store import FORMAT, PriorStore
 
 pytest.importorskip("cv2")

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from d2_plugin.priors.fuse import FusedPrior, fuse
+from d2_plugin.priors.fuse import fuse
 from d2_plugin.priors.monocular.align import align, aligned_depth
 from d2_plugin.priors.monocular.correct import corrected_depth, corrected_without
 from d2_plugin.priors.monocular.extrapolation import extrapolation_error
@@ -18,6 +18,7 @@ from d2_plugin.priors.monocular.uncertainty import monocular_uncertainty
 from d2_plugin.protocol import Label
 from d2_plugin.recordings.recording import MonoKind
 from d2_plugin.recordings.synthetic.room import synthetic_recording
+from d2_plugin.store.maps import FusedPrior
 
 cv2 = pytest.importorskip("cv2")
 

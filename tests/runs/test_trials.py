@@ -13,7 +13,6 @@ import torch
 
 from d2_plugin.config import D2Config
 from d2_plugin.hooks.prior import PriorLoader, believed
-from d2_plugin.priors.fuse import FusedPrior
 from d2_plugin.priors.summary import PriorSummary
 from d2_plugin.protocol import DepthPrior, Label
 from d2_plugin.recordings import Recording, open_recording
@@ -24,6 +23,7 @@ from d2_plugin.runs.prior.trials import Score, Trials, can_decide, leave_out_in_
 from d2_plugin.runs.run import Run
 from d2_plugin.runs.settings import RunSettings
 from d2_plugin.runs.start import TimedPoints
+from d2_plugin.store.maps import FusedPrior
 from d2_plugin.store.store import PriorStore
 
 NETWORK = "mobile_pydnet.onnx"

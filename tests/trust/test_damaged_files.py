@@ -28,7 +28,6 @@ from d2_plugin.config import D2Config, for_iterations
 from d2_plugin.durable import write_table
 from d2_plugin.priors.colmap.workspace import read_dense_array
 from d2_plugin.priors.depth_on_disk import SensorDepth
-from d2_plugin.priors.fuse import FusedPrior
 from d2_plugin.priors.monocular.network import MonocularModel
 from d2_plugin.protocol import EXPORT_FILE, Label
 from d2_plugin.reading import read_json
@@ -43,6 +42,7 @@ from d2_plugin.runs.report.report import collect, make_report
 from d2_plugin.runs.saved import METRICS, RUN, load_checkpoint, read_metrics, read_run, save_checkpoint
 from d2_plugin.runs.start import TimedPoints
 from d2_plugin.store.exported import RenamedStore
+from d2_plugin.store.maps import FusedPrior
 from d2_plugin.store.store import PriorStore
 from d2_plugin.viewing.camera_paths import read_camera_path
 from d2_plugin.viewing.checkpoints import read_ply

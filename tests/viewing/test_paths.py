@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from d2_plugin.errors import D2Error
 from d2_plugin.recordings import Camera
+from d2_plugin.recordings.cameras.camera import look_at
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.viewing.camera_paths import (
     MARGIN,
@@ -20,7 +21,6 @@ from d2_plugin.viewing.camera_paths import (
     camera_path_text,
     focus_of,
     for_size,
-    look_at,
     orbit,
     read_camera_path,
 )

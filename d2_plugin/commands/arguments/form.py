@@ -144,7 +144,6 @@ class Form:
         return read(setting, texts, typed_as(setting))
 
     def _placed(self, words: Sequence[str]) -> dict[str, Any]:
-        """The settings that are taken by their place, in the order of their declaration."""
         left, values = list(words), {}
         for setting in (s for s in self.settings if s.positional):
             count = len(left) if item_kind(setting.kind) is not None else 1
@@ -176,7 +175,6 @@ def typed_as(setting: Declared) -> str:
 
 
 def _sections(name: str, kind: type, without: tuple[str, ...] = ()) -> Iterator[Section]:
-    """The table `name` and the tables inside it."""
     settings = [setting for setting in declared(kind) if setting.name not in without]
     inner = {s.name: option for s in settings for option in (s.kind, *get_args(s.kind)) if is_dataclass(option)}
     text = (kind.__doc__ or "").strip()
@@ -208,7 +206,6 @@ def _typed(words: Sequence[str]) -> dict[str, str]:
 
 
 def _as_toml(value: Any) -> Any:
-    """A value as TOML would give it."""
     if isinstance(value, tuple):
         return [_as_toml(item) for item in value]
     return value if isinstance(value, (bool, int, float, str, type(None))) else str(value)

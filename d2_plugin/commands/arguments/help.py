@@ -50,7 +50,6 @@ def _overview(form: Form) -> str:
 
 
 def _tables(form: Form, sections: dict[str, Section]) -> str:
-    """One line per table."""
     lines = ["Tables of settings; they may also stand in a --config file, and flags win:"]
     for name, section in sections.items():
         count = len(section.settings)
@@ -65,14 +64,12 @@ def _table(section: Section) -> str:
 
 
 def _typed(setting: Declared) -> str:
-    """A setting of a command as it is typed."""
     if setting.positional:
         return typed_as(setting) + (" ..." if item_kind(setting.kind) is not None else "")
     return typed_as(setting) if is_switch(setting) else f"{typed_as(setting)} {placeholder(setting.kind)}"
 
 
 def _explained(setting: Declared) -> str:
-    """The docstring, then range, unit and default."""
     where = limits(setting)
     bounds = ", ".join(part for part in (where.unit, where.described()) if part not in ("", "finite"))
     facts = [bounds, "needed" if setting.default is MISSING else _default(setting)]

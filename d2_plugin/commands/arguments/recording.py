@@ -5,7 +5,6 @@ Defaults come first, the tables of a --config file over them, and flags over bot
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, is_dataclass
 from pathlib import Path
@@ -13,6 +12,7 @@ from typing import TYPE_CHECKING, Any, get_args
 
 from d2_plugin.commands.arguments.form import Form, Given, Group
 from d2_plugin.errors import D2Error, unknown_name
+from d2_plugin.progress import show
 from d2_plugin.reading import NoSuchFile, shown_path
 from d2_plugin.reading import read_toml as tables_of_toml
 from d2_plugin.settings import Settings, declared
@@ -140,12 +140,6 @@ def read_toml(path: Path | None) -> dict[str, Any]:
         return tables_of_toml(path, "correct the configuration")
     except NoSuchFile:
         raise D2Error(f"no configuration at {shown_path(path)}: write one, or leave out --config") from None
-
-
-def show(*lines: str) -> None:
-    """Print at once, before long work starts."""
-    sys.stdout.write("".join(f"{line}\n" for line in lines))
-    sys.stdout.flush()
 
 
 def show_notes(notes: Sequence[str]) -> None:

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
 from d2_plugin.errors import D2Error
-from d2_plugin.settings import Declared, Range, checked
-from d2_plugin.values import bare_and_range, options_of
+from d2_plugin.settings import Declared, Range
+from d2_plugin.values import bare_and_range, checked, options_of
 
 MOST_NUMBERS = 1_000_000
 """How many numbers a list may hold: a range of more would fill the memory."""

@@ -24,6 +24,7 @@ import numpy as np
 from d2_plugin.errors import D2Error
 from d2_plugin.extras import import_pycolmap
 from d2_plugin.reading import said
+from d2_plugin.recordings.cameras.calibrating.features import as_colmap
 from d2_plugin.recordings.cameras.epipolar import sampson
 from d2_plugin.recordings.recording import Camera, Recording
 
@@ -218,13 +219,9 @@ def _triangulated(
 def _posed_model(pycolmap: ModuleType, cameras: Sequence[Camera]) -> Any:
     model = pycolmap.Reconstruction()
     for number, camera in enumerate(cameras, start=1):
-        K, transform = camera.K, camera.T_camera_world
-        parameters = [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]  # COLMAP's pixel centres are at i + 0.5, as ours
-        lens = pycolmap.Camera(
-            camera_id=number, model="PINHOLE", width=camera.width, height=camera.height, params=parameters
-        )
+        transform = camera.T_camera_world
         pose = pycolmap.Rigid3d(pycolmap.Rotation3d(transform[:3, :3]), transform[:3, 3])
-        model.add_camera_with_trivial_rig(lens)
+        model.add_camera_with_trivial_rig(as_colmap(camera, number))
         image = pycolmap.Image(name=f"{number}", camera_id=number, image_id=number)
         model.add_image_with_trivial_frame(image, pose)
     return model

@@ -90,7 +90,6 @@ _Instant = structure(
 )
 """d2::View, Pair and Instant of kernels/cross_view.cpp."""
 
-
 _NUMBERS = {
     "continuous": CONTINUOUS,
     "like": LIKE * 255,

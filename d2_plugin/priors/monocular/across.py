@@ -291,7 +291,6 @@ def _apart(ours: _Map, theirs: _Map, line: _Line, their_lines: Sequence[_Line]) 
 
 
 def _through(alignment: Alignment, view: Shown, line: _Line, kind: MonoKind) -> Alignment:
-    """The view's own fit with another line."""
     anchors = predicted(view.mono) & (view.geometric > 0)
     turned = line.scale * view.mono[anchors].astype(np.float64) + line.shift
     depth = 1 / np.where(turned > 0, turned, np.nan) if kind == "relative" else turned

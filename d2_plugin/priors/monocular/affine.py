@@ -172,7 +172,6 @@ class _Problem:
         return np.sqrt(r * r + self.epsilon * self.epsilon)
 
     def sums(self, a: float, b: float) -> Sums:
-        """All that a step from (a, b) needs."""
         r = self.residual(a, b)
         inverse_root = 1 / self.root(r)
         u, sharp = r * inverse_root, self.epsilon * inverse_root
@@ -181,7 +180,6 @@ class _Problem:
         return Sums(dot(r, u / (1 + sharp)), slope, *(self.normal(curvature) for curvature in curvatures))
 
     def normal(self, curvature: np.ndarray) -> Normal:
-        """The matrix of `curvature` [n]."""
         cp = curvature * self.p
         return dot(cp, self.p), dot(cp, self.q), dot(curvature * self.q, self.q)
 

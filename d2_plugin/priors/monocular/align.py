@@ -213,7 +213,6 @@ class _Fitted(NamedTuple):
 
 
 def _fitted(mono: np.ndarray, geometric: np.ndarray, kind: MonoKind, settings: AlignSettings) -> _Fitted | Alignment:
-    """The line, or why there is none."""
     anchors = np.flatnonzero(predicted(mono) & np.isfinite(geometric) & (geometric > 0))
     count = int(anchors.size)
     if count == 0:

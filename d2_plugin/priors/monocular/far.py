@@ -70,7 +70,6 @@ def _large(cv2: Any, mask: np.ndarray) -> np.ndarray:
 
 
 def _like_around(cv2: Any, image: np.ndarray, clear: np.ndarray) -> np.ndarray:
-    """Pixels whose colour is that of the clear pixels around them."""
     sigma = AROUND * clear.shape[1]
     weight = cv2.GaussianBlur(clear.astype(np.float32), (0, 0), sigma)
     mean = cv2.GaussianBlur(image * clear[..., None], (0, 0), sigma) / np.maximum(weight, 1e-6)[..., None]
@@ -79,7 +78,6 @@ def _like_around(cv2: Any, image: np.ndarray, clear: np.ndarray) -> np.ndarray:
 
 
 def _touching(cv2: Any, mask: np.ndarray, seeds: np.ndarray) -> np.ndarray:
-    """The connected pieces of `mask` that hold a seed."""
     count, pieces = cv2.connectedComponents(mask.astype(np.uint8), connectivity=4)
     keep = np.zeros(count, bool)
     keep[np.unique(pieces[seeds & mask])] = True

@@ -17,7 +17,8 @@ from typing import Any, get_args
 
 import numpy as np
 
-from d2_plugin.errors import D2Error, missing_extra, refuse_unknown, unknown_name
+from d2_plugin.errors import D2Error, refuse_unknown
+from d2_plugin.extras import imported
 from d2_plugin.priors.monocular.align import KINDS
 from d2_plugin.priors.settings import Preprocessing
 from d2_plugin.reading import parsing, said
@@ -102,8 +103,7 @@ class MonocularModel:
         views: int | None = None,
     ) -> None:
         self.path, self.kind = Path(path), kind
-        if kind not in KINDS:
-            raise unknown_name("monocular kind", str(kind), KINDS)
+        refuse_unknown("monocular kind", [str(kind)], KINDS)
         refuse_unknown("preprocessing", [preprocessing], PREPROCESSINGS)
         self.session = _session(self.path, threads)
         self.input = NetworkInput.of(self.session, self.path, views)
@@ -228,10 +228,7 @@ def _recognised(network: NetworkInput) -> str:
 
 
 def _session(path: Path, threads: int) -> Any:
-    try:
-        import onnxruntime
-    except ImportError:
-        raise missing_extra("onnxruntime", "mono", "monocular depth from an ONNX file") from None
+    onnxruntime = imported("onnxruntime", "onnxruntime", "mono", "monocular depth from an ONNX file")
     if not path.is_file():
         raise D2Error(f"no monocular network at {path}: give the path of an ONNX file")
     options = onnxruntime.SessionOptions()

@@ -45,5 +45,4 @@ def follow_images(seen: Sequence[np.ndarray], shown: Sequence[np.ndarray]) -> bo
 
 
 def _overlap(one: np.ndarray, other: np.ndarray) -> float:
-    """Pixels that both have, of those that either has."""
     return float((one & other).sum() / max((one | other).sum(), 1))

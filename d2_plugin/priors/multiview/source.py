@@ -74,7 +74,7 @@ class MultiviewSource:
         self.cameras = {name: camera for name, camera in recording.cameras.items() if name in names}
         self.frames, self.model = recording.frames, None
         self.orders = [list(self.cameras), list(recording.cameras)]
-        self._last: dict[int, Predicted] = {}
+        self._read = functools.lru_cache(maxsize=2)(self._found)
         self._scale: tuple[float, Predicted] | None = None
         if path.suffix.lower() == ".onnx":
             self.model = MonocularModel(
@@ -199,12 +199,9 @@ class MultiviewSource:
         small = [cv2.resize(images[name], size, interpolation=cv2.INTER_AREA) for name in self.cameras]
         return Instant(np.stack(small).astype(np.float32), np.log(depth) - log_ratio(depth, first))
 
-    def _read(self, number: int) -> Predicted:
-        """The prediction of one frame, of the training cameras in their order; the last two are kept."""
-        if number not in self._last:
-            found = self._computed(number) if self.model is not None else self._stored(self.files[number])
-            self._last = dict([*self._last.items()][-1:]) | {number: found}
-        return self._last[number]
+    def _found(self, number: int) -> Predicted:
+        """The prediction of one frame, of the training cameras in their order."""
+        return self._computed(number) if self.model is not None else self._stored(self.files[number])
 
     def _stored(self, path: Path) -> Predicted:
         prediction = read_prediction(path, tuple(dict.fromkeys(len(order) for order in self.orders)))

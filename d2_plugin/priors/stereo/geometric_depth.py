@@ -12,7 +12,7 @@ from itertools import repeat
 
 import numpy as np
 
-from d2_plugin.priors.geometry import check_depth_range, check_views, scaled_camera
+from d2_plugin.priors.geometry import check_views, scaled_camera
 from d2_plugin.priors.stereo.filtering.confirm import RELATIVE_DEPTH
 from d2_plugin.priors.stereo.filtering.filter import GeometricDepth, filter_depths
 from d2_plugin.priors.stereo.patchmatch import patchmatch
@@ -51,7 +51,6 @@ def geometric_depth(
         D2Error: fewer than two views, images of another size than their camera, an inverted range.
     """
     check_views(images, cameras)
-    depth_range = check_depth_range(depth_range)
     grays = [gray(image) for image in images]
     by_scale = []
     for scale, memory in zip(SCALES, memories or repeat(None)):

@@ -37,7 +37,6 @@ CONSENSUS_RADIUS = 3
 CONSENSUS_TOLERANCE = 0.02
 """Neighbouring planes agree when they pass within this share of the inverse depth."""
 
-
 Source = structure("int width height first", "float A[9] k[3]")
 """d2::Source of kernels/matching.h: a view as the reference sees it."""
 
@@ -49,7 +48,6 @@ Task = structure(
     "pointer gray wanted sources quads planes costs views",
 )
 """d2::Task of kernels/spread.h: what the planes of one reference view spread by."""
-
 
 Arrays = dict[str, np.ndarray]
 """What the pointers of a task point to, by their names."""

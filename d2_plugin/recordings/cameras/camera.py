@@ -107,6 +107,22 @@ def rigid(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
     return transform
 
 
+def unit(vector: np.ndarray) -> np.ndarray:
+    """The vector at length 1."""
+    return vector / max(np.linalg.norm(vector), 1e-12)
+
+
+def look_at(position: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """T_camera_world [4, 4] of a camera at `position` that looks at `target`, upright."""
+    forward = unit(target - position)
+    right = np.cross(forward, up)
+    if np.linalg.norm(right) < 1e-9:  # straight up or down: any side will do
+        right = np.cross(forward, np.roll(up, 1))
+    right = unit(right)
+    R = np.stack([right, np.cross(forward, right), forward])
+    return rigid(R, -R @ position)
+
+
 def resized(K: np.ndarray, calibrated: tuple[int, int], images: tuple[int, int], name: str, where: str) -> np.ndarray:
     """K for images that are smaller or larger copies of the size (width, height) that was calibrated."""
     if not all(1 <= length <= LARGEST_SIDE for length in (*calibrated, *images)):

@@ -132,14 +132,12 @@ def _shares(one: Camera, other: Camera, depths: np.ndarray) -> bool:
 
 
 def _frames(recording: Recording, cameras: int) -> tuple[int, ...]:
-    """Frames to look at, spread over the recording."""
     pixels = max(camera.width * camera.height for camera in recording.cameras.values())
     count = min(max(LOOKED_AT // (pixels * max(cameras, 1)), 2), len(recording.frames))
     return tuple(spread(recording.frames, count))
 
 
 def _plain(recording: Recording, cameras: Sequence[str]) -> Iterator[str]:
-    """Images of one colour."""
     for name in cameras:
         blank: dict[str, list[int]] = {}
         for frame in _frames(recording, len(cameras)):

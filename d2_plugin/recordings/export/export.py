@@ -14,9 +14,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
-
-import numpy as np
 
 from d2_plugin.errors import D2Error, refuse_unknown
 from d2_plugin.protocol import EXPORT_FILE
@@ -27,7 +24,7 @@ from d2_plugin.recordings.export.colmap import write_colmap, write_colmap_frames
 from d2_plugin.recordings.export.n3dv import write_n3dv
 from d2_plugin.recordings.export.ply import PointCloud
 from d2_plugin.recordings.export.transforms_json import write_transforms
-from d2_plugin.recordings.recording import Camera, Recording
+from d2_plugin.recordings.recording import Recording
 from d2_plugin.values import checked_arguments
 
 WRITERS: dict[str, Callable[[Export], Written]] = {
@@ -74,19 +71,13 @@ def export_recording(
             "layout": layout,
             "cameras": written.cameras,
             "frames": written.frames,
-            "calibrations": {name: _calibration(camera) for name, camera in recording.cameras.items()},
+            "calibrations": {name: camera.calibration() for name, camera in recording.cameras.items()},
             "fps": recording.fps,
             "test_cameras": [written.cameras[name] for name in held_out if name in written.cameras],
         }
         # Written last: a folder without it is half an export.
         (folder / EXPORT_FILE).write_text(json_text(description, EXPORT_FILE, indent=1) + "\n")
     return Path(path)
-
-
-def _calibration(camera: Camera) -> dict[str, Any]:
-    """By which a prior store knows its recording again (d2_plugin.priors.frame.describe_camera)."""
-    K, pose = (np.asarray(matrix, float).tolist() for matrix in (camera.K, camera.T_camera_world))
-    return {"size": [camera.width, camera.height], "K": K, "T_camera_world": pose}
 
 
 def _known(recording: Recording, test_cameras: Sequence[str]) -> tuple[str, ...]:

@@ -56,9 +56,9 @@ def grid_of(
     begin, end = max(one[0] for one in taken.values()), min(one[-1] for one in taken.values())
     fps = rate or usual_rate(min((video.rate for video in videos.values() if video.rate), default=25.0))
     if end < begin - REACH / fps:
-        late, early = max(taken, key=lambda name: taken[name][0]), min(taken, key=lambda name: taken[name][-1])
+        last, early = max(taken, key=lambda name: taken[name][0]), min(taken, key=lambda name: taken[name][-1])
         raise D2Error(
-            f"camera {early} stopped {begin - end:.2f} seconds before camera {late} began: leave one out, or correct "
+            f"camera {early} stopped {begin - end:.2f} seconds before camera {last} began: leave one out, or correct "
             "--offsets"
         )
     first = taken[next(iter(videos))]
@@ -75,10 +75,8 @@ def grid_of(
     frames = numbers[kept].tolist()
     indices = {name: dict(zip(frames, place[kept].tolist())) for name, (place, _) in near.items()}
     together = all(np.abs(off[kept]).max() <= TOGETHER for _, off in near.values())
-    lateness = (
-        {} if together else {name: dict(zip(frames, off[kept].round(6).tolist())) for name, (_, off) in near.items()}
-    )
-    return Grid(fps, indices, {} if together else lateness, _notes(kept, videos, fps))
+    late = {name: dict(zip(frames, off[kept].round(6).tolist())) for name, (_, off) in near.items()}
+    return Grid(fps, indices, {} if together else late, _notes(kept, videos, fps))
 
 
 def _asked(numbers: np.ndarray, fps: float, times: Sequence[float] | None, frames: Sequence[int] | None) -> np.ndarray:

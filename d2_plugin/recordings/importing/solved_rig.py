@@ -164,7 +164,6 @@ def _taker(path: Path, lenses: Lenses) -> str:
 
 
 def _as_taken(path: Path, camera: CalibratedCamera) -> np.ndarray:
-    """The still as a video of the same camera would show it."""
     cv2 = opencv("reading stills", "calibration")
     image, size = read_image(path), camera.size
     if abs(image.shape[1] * size[1] - image.shape[0] * size[0]) > 0.01 * image.shape[0] * size[0]:

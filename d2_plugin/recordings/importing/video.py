@@ -38,8 +38,6 @@ NOT_READ = (".gif", ".sdp", ".m3u8", ".wmv", ".flv", ".ogv", ".3gp", ".vob", ".m
 
 _log = logging.getLogger(__name__)
 
-REMEDY = "replace the file or leave its camera out"
-
 MOST_FRAMES = 10_000_000  # A video that has more is damaged: this many are four days at 30 per second
 
 OPENING = {
@@ -260,7 +258,6 @@ class Decoder:
         self._container, self._reached = None, -1
 
     def _frame(self, index: int) -> Any:
-        """The decoded frame whose stamp is that of `index`."""
         why = ""
         try:
             self._approach(index)
@@ -281,7 +278,6 @@ class Decoder:
         )
 
     def _place(self, frame: Any) -> int:
-        """Which frame of the video it is."""
         if self.video.counted:
             self._reached += 1
             return self._reached

@@ -68,7 +68,6 @@ def open_technicolor(path: Path, cameras: tuple[str, ...] | None = None, interse
 
 
 def _rows(path: Path) -> dict[str, np.ndarray]:
-    """Numbers of each camera by its name."""
     with parsing(str(path), "expected a header and one line of numbers per camera"):
         lines = [line.split() for line in read_text(path).splitlines()[1:] if line.strip()]
         rows = [np.array([float(field) for field in line]) for line in lines]

@@ -27,8 +27,6 @@ STATIC_FPS = 30.0  # frame rate of files without times, where it means nothing
 
 
 class _Entry(NamedTuple):
-    """One image, its file and who lists it."""
-
     image: ListedImage
     file: Path
     listed_in: Path
@@ -110,7 +108,6 @@ def _shots(entries: dict[str, _Entry], path: Path) -> tuple[dict[str, Shot], flo
 
 
 def _rate(entry: _Entry, path: Path) -> float | None:
-    """The frame rate that a file declares, or None."""
     rate = field(entry.image.table, "fps", Optional[float], str(entry.listed_in), CORRECT, None)  # noqa: UP045
     return checked_rate(rate, str(path)) if rate else None  # 0 is how some programs say that there is none
 

@@ -44,7 +44,6 @@ def open_videos(path: Path, cameras: tuple[str, ...] | None = None, intersect: b
 
 
 def _refuse_changed(video: VideoFile, name: str) -> None:
-    """Raise where a video is gone or another one."""
     if not video.path.is_file():
         raise D2Error(
             f"the video of camera {name} is not at {shown_path(video.path)} any more: put it back, or import again "

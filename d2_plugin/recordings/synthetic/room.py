@@ -19,7 +19,7 @@ from functools import lru_cache
 import numpy as np
 
 from d2_plugin.errors import D2Error
-from d2_plugin.recordings.cameras.camera import pinhole, rigid
+from d2_plugin.recordings.cameras.camera import look_at, pinhole
 from d2_plugin.recordings.recording import Camera, Recording, Source
 from d2_plugin.recordings.synthetic import materials
 from d2_plugin.recordings.synthetic.raycast import Motion, Room, Scene, Solid, render_color, render_depth
@@ -30,7 +30,6 @@ TARGET = np.array([0.0, 0.1, 0.75])  # world point (metres, z up) that every cam
 
 ROOM_LOW, ROOM_HIGH = np.array([-2.6, -5.0, 0.0]), np.array([2.6, 2.0, 2.9])
 """Corners of the room; the cameras stand inside."""
-
 
 EDGE_BLUR = 0.006
 """Of an emulated monocular map: the standard deviation of its blur, as a fraction of the image's width."""
@@ -160,14 +159,9 @@ class SyntheticSource(Source):
 def _look_at(name: str, angle: float, camera_height: float, width: int, height: int, distance: float = 4.0) -> Camera:
     centre = TARGET + distance * np.array([math.sin(angle), -math.cos(angle), 0.0])
     centre[2] = camera_height
-    forward = (TARGET - centre) / np.linalg.norm(TARGET - centre)
-    right = np.cross(forward, (0.0, 0.0, 1.0))
-    right /= np.linalg.norm(right)
-    rotation = np.stack([right, np.cross(forward, right), forward])
-    focal = 0.85 * width
-    farthest = np.maximum(forward * (ROOM_LOW - centre), forward * (ROOM_HIGH - centre)).sum()
-    transform = rigid(rotation, -rotation @ centre)
-    return Camera(name, width, height, pinhole(focal, focal, width / 2, height / 2), transform, (1.0, float(farthest)))
+    pose, focal = look_at(centre, TARGET, np.array([0.0, 0.0, 1.0])), 0.85 * width
+    farthest = np.maximum(pose[2, :3] * (ROOM_LOW - centre), pose[2, :3] * (ROOM_HIGH - centre)).sum()
+    return Camera(name, width, height, pinhole(focal, focal, width / 2, height / 2), pose, (1.0, float(farthest)))
 
 
 def _box(
@@ -182,8 +176,6 @@ def _box(
 
 
 def _rolling(moving: bool, radius: float = 0.27, amplitude: float = 0.85, period: float = 4.0) -> Motion:
-    """A ball that rolls left and right without slipping."""
-
     def motion(seconds: float) -> tuple[np.ndarray, np.ndarray]:
         x = amplitude * math.sin(2 * math.pi * (seconds if moving else 0.0) / period - 0.6)
         angle = x / radius
@@ -194,8 +186,6 @@ def _rolling(moving: bool, radius: float = 0.27, amplitude: float = 0.85, period
 
 
 def _turning(moving: bool, period: float = 5.0) -> Motion:
-    """A cube that travels on an ellipse above the rug while it turns about the vertical axis."""
-
     def motion(seconds: float) -> tuple[np.ndarray, np.ndarray]:
         phase = 2 * math.pi * (seconds if moving else 0.0) / period
         centre = np.array([0.55 * math.cos(phase), 0.55 + 0.3 * math.sin(phase), 0.75 + 0.15 * math.sin(2 * phase)])

@@ -155,7 +155,6 @@ def _frozen(values: dict[str, Any]) -> SimpleNamespace:
 
 
 def _adapter(name: str, *arguments: Any, **options: Any) -> Any:
-    """The adapter of that name around what it takes."""
     adapter: Any = registry.load(registry.ADAPTERS, name)
     return adapter(*arguments, **options)
 

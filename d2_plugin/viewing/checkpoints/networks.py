@@ -146,5 +146,4 @@ class PlaneField:
 
 
 def _linear(state: Mapping[str, Tensor], name: str, values: Tensor) -> Tensor:
-    """The linear layer of that name."""
     return functional.linear(values, state[f"{name}.weight"], state[f"{name}.bias"])

@@ -138,7 +138,6 @@ def _code_state(state: State) -> list[Coded]:
 
 
 def _code_colors(harmonics: Harmonics) -> list[Coded]:
-    """The constant colours, and the harmonics above them."""
     coefficients = harmonics.coefficients
     arrays = [encode("colors", coefficients[:, 0].numpy(), LOOK_BITS)]
     if coefficients.shape[1] > 1:

@@ -91,7 +91,6 @@ def write_export(scenes: list[ExportScene], settings: Export, folder: Path) -> W
 
 
 def _frame_files(scene: ExportScene, settings: Export, folder: Path) -> list[Path]:
-    """One file of Gaussians that stand still for each frame."""
     chosen = scene.viewed.recording.frames if settings.frames is None else settings.frames
     for frame in chosen:
         if frame not in scene.viewed.recording.frames:
@@ -114,7 +113,6 @@ def _frame_files(scene: ExportScene, settings: Export, folder: Path) -> list[Pat
 
 
 def _convert(ply: Path, path: Path) -> None:
-    """Let PlayCanvas's converter write a file of another format."""
     program = shutil.which(CONVERTER)
     if program is None:
         raise D2Error(

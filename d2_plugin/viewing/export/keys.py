@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from d2_plugin.recordings.selection import spread
 from d2_plugin.viewing.export.ply import ALPHA_MIN
 from d2_plugin.viewing.export.scene import ExportScene
 
@@ -111,7 +112,7 @@ def bake(scene: ExportScene) -> Keys:
     straight lines are good, or all."""
     frames, count = scene.seconds, len(scene.harmonics.coefficients)
     times = sorted({*frames, *((a + b) / 2 for a, b in itertools.pairwise(frames))})
-    times = [times[i] for i in _spread(len(times), max(MOST_STATES // max(count, 1), 12))]
+    times = spread(times, min(max(MOST_STATES // max(count, 1), 12), len(times)))
     states = [state_at(scene, times[0])]
     for time in times[1:]:
         states.append(state_at(scene, time, states[-1]))
@@ -134,7 +135,7 @@ def bake(scene: ExportScene) -> Keys:
     keys, number = None, 2
     while keys is None or (keys.offset.hundredth > GOOD and number < len(times)):
         number = 2 if keys is None else min(2 * number - 1, len(times))
-        chosen = _spread(len(times), number)
+        chosen = spread(range(len(times)), number)
         kept = tuple(State(s.positions[:moving], s.factors[:changing], s.opacities[:changing]) for s in states)
         kept = tuple(kept[i] for i in chosen)
         keys = Keys(tuple(times[i] for i in chosen), states[0], rows, moving, changing, kept, Offset(0, 0))
@@ -145,11 +146,6 @@ def bake(scene: ExportScene) -> Keys:
             off = torch.maximum(off, torch.where(state.opacities >= ALPHA_MIN, apart, 0))
         keys = replace(keys, offset=Offset.of(off))
     return keys
-
-
-def _spread(count: int, most: int) -> list[int]:
-    """At most so many of the places 0 .. count - 1, the ends among them, evenly."""
-    return [int(i) for i in np.unique(np.linspace(0, count - 1, min(most, count)).round())]
 
 
 def distance(a: Tensor, b: Tensor) -> Tensor:

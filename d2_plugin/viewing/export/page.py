@@ -20,6 +20,7 @@ from d2_plugin.gaussians.slicing import MARGINAL_CUT
 from d2_plugin.reading import json_text
 from d2_plugin.recordings import Camera
 from d2_plugin.recordings.images import opencv
+from d2_plugin.recordings.selection import spread
 from d2_plugin.runs.drawing import color_scale
 from d2_plugin.viewing.export.coded import BLOCK, MARGINAL_REACH, CodedScene, code_keys, code_lines
 from d2_plugin.viewing.export.keys import bake
@@ -89,7 +90,7 @@ def _recorded(scene: ExportScene, data: bytearray) -> dict[str, list[tuple[int, 
         return bytes(cv2.imencode(".webp", pixels[..., ::-1], quality)[1])
 
     most = max(int(RECORDED_BYTES / sum(len(image(camera, 0)) for camera in cameras)), 1)
-    places = np.unique(np.linspace(0, len(recording.frames) - 1, most).round().astype(int)).tolist()
+    places = spread(range(len(recording.frames)), most)
     kept: dict[str, list[tuple[int, int, int]]] = {}
     for camera in cameras:
         for place in places:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import itertools
-import sys
 import time
 from collections import deque
 from collections.abc import Iterator
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -14,6 +14,7 @@ from typing import Annotated, Any
 import torch
 
 from d2_plugin.errors import D2Error
+from d2_plugin.progress import show
 from d2_plugin.recordings import open_recording
 from d2_plugin.runs.metrics import psnr
 from d2_plugin.runs.run import Run
@@ -56,13 +57,9 @@ def run(settings: ViewSettings) -> str:
     """Show it until Ctrl-C."""
     viewed = viewed_at(settings)
     viewer = Viewer(viewed=viewed, host=settings.host, port=settings.port, height=settings.height)
-    _print(*([f"     note  {viewed.note}"] if viewed.note else []), address_line(viewer, settings.host))
-    try:
+    show(*([f"     note  {viewed.note}"] if viewed.note else []), address_line(viewer, settings.host))
+    with closing(viewer), suppress(KeyboardInterrupt):
         viewer.stay()
-    except KeyboardInterrupt:
-        pass
-    finally:
-        viewer.close()
     return "closed"
 
 
@@ -92,11 +89,6 @@ def address_line(viewer: Viewer, host: str) -> str:
     return f"{viewer.url}  (Ctrl-C ends){who}"
 
 
-def _print(*lines: str) -> None:
-    sys.stdout.write("".join(f"{line}\n" for line in lines))
-    sys.stdout.flush()
-
-
 class LiveRun:
     """A run that is watched: give `watch` to `Run.train`."""
 
@@ -112,7 +104,7 @@ class LiveRun:
         scores = _scores(viewed)
         if trainer.d2 is not None:
             viewer.marks = lambda: trainer.d2.inserted_at
-        _print(f"watch it train at {viewer.url}")
+        show(f"watch it train at {viewer.url}")
 
         def on_step(step: int, loss: float) -> None:
             if viewer.clients and (score := next(scores)) is not None:
@@ -125,15 +117,10 @@ class LiveRun:
         """After the training: as long as a page is open."""
         if self.viewer is None:
             return
-        viewer = self.viewer
-        try:
+        with closing(self.viewer) as viewer, suppress(KeyboardInterrupt):
             if viewer.clients:
-                _print(f"{viewer.url} stays until its last page is closed, or Ctrl-C")
+                show(f"{viewer.url} stays until its last page is closed, or Ctrl-C")
             viewer.stay(lambda: not viewer.clients)
-        except KeyboardInterrupt:
-            pass
-        finally:
-            viewer.close()
 
 
 def _scores(viewed: ViewedRun) -> Iterator[str | None]:

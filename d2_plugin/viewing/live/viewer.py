@@ -149,7 +149,6 @@ class Viewer:
         self._wake.set()
 
     def _open_pages(self) -> list[tuple[Page, Overlay]]:
-        """The pages of all clients; those of new ones are laid out."""
         viewed, clients = self.viewed, dict(self._clients)
         for gone in self._pages.keys() - clients.keys():
             del self._pages[gone]

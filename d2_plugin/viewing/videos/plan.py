@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
 import numpy as np
 
-from d2_plugin.errors import D2Error, unknown_name
+from d2_plugin.errors import D2Error, refuse_unknown, unknown_name
 from d2_plugin.recordings import Camera
 from d2_plugin.settings import Downscale, Positional, Range, Settings
 from d2_plugin.viewing.camera_paths import orbit, read_camera_path
@@ -127,9 +126,9 @@ def _instants(viewed: ViewedRun, settings: RenderSettings, count: int, fps: floa
 
 
 def _standing(viewed: ViewedRun, settings: RenderSettings, fps: float) -> list[Stop]:
-    """Each of the cameras in turn, the whole recording at each."""
     of_path = viewed.test_cameras if settings.path == "held-out" else viewed.train_cameras
-    names = _known(viewed, settings.cameras or of_path)
+    names = settings.cameras or of_path
+    refuse_unknown("camera", names, viewed.recording.cameras)
     if not names:
         raise D2Error(f"{viewed.name} has no held-out camera: choose --path training or orbit")
     if settings.seconds is not None:
@@ -143,7 +142,8 @@ def _standing(viewed: ViewedRun, settings: RenderSettings, fps: float) -> list[S
 
 
 def _orbiting(viewed: ViewedRun, settings: RenderSettings, fps: float) -> list[Stop]:
-    names = _known(viewed, settings.cameras or viewed.train_cameras)
+    names = settings.cameras or viewed.train_cameras
+    refuse_unknown("camera", names, viewed.recording.cameras)
     cameras = [viewed.recording.cameras[name] for name in names]
     played = 0 if settings.at is not None else viewed.duration / settings.speed
     count = _count((settings.seconds or max(MOVING_SECONDS, played)) * fps, 2)
@@ -171,10 +171,3 @@ def _count(images: float, least: int) -> int:
             "--fps or a higher --speed"
         )
     return max(round(images), least)
-
-
-def _known(viewed: ViewedRun, names: Sequence[str]) -> Sequence[str]:
-    for name in names:
-        if name not in viewed.recording.cameras:
-            raise unknown_name("camera", name, viewed.recording.cameras)
-    return names

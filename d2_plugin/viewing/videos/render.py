@@ -7,10 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from d2_plugin.errors import D2Error, unknown_name
+from d2_plugin.errors import D2Error, refuse_unknown
 from d2_plugin.extras import import_av
 from d2_plugin.progress import progress_bar
 from d2_plugin.recordings.checks.memory import check_bytes
+from d2_plugin.recordings.selection import spread
 from d2_plugin.runs.drawing import GAP, Panel, Scale, depth_scale, side_by_side
 from d2_plugin.viewing.checkpoints import open_viewed
 from d2_plugin.viewing.panels import KINDS, Shot
@@ -62,14 +63,11 @@ def run(settings: RenderSettings) -> str:
 
 
 def _check(settings: RenderSettings) -> None:
-    """Refuse before anything is opened what cannot be drawn."""
     if not settings.runs:
         raise D2Error("d2 render needs RUN: give the --output folder of `d2 train`")
     if not settings.show:
         raise D2Error(f"--show names nothing: have {', '.join(KINDS)}")
-    for name in settings.show:
-        if name not in KINDS:
-            raise unknown_name("image", name, KINDS)
+    refuse_unknown("image", settings.show, KINDS)
     if settings.recorded and settings.path not in ("held-out", "training"):
         raise D2Error(
             f"--show {settings.recorded[0]} is known at the recording's cameras only: choose --path held-out or "
@@ -127,8 +125,7 @@ def _depths(runs: Sequence[ViewedRun], plan: Plan, size: tuple[int, int], show: 
     """The range of depths of a video, from a few of its images; not computed where none is shown."""
     if not {"depth", "true-depth"} & set(show):
         return 0.0, 1.0
-    chosen = np.unique(np.linspace(0, len(plan.stops) - 1, SAMPLED).round().astype(int))
     small = max(size[0] // 2, 1), max(size[1] // 2, 1)
-    stops = [plan.stops[i] for i in chosen]
+    stops = spread(plan.stops, SAMPLED)
     views = [(viewed, viewed.view(stop.camera, stop.time, small)) for viewed in runs for stop in stops]
     return depth_scale([render_view(viewed.backbone, view).depth.numpy() for viewed, view in views])

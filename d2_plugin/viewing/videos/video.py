@@ -7,8 +7,6 @@ copy of its last. Nothing is scaled. Scores are never computed from a video.
 from __future__ import annotations
 
 import itertools
-import os
-import secrets
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from fractions import Fraction
@@ -17,7 +15,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from d2_plugin.durable import LEFTOVER, make_folder, remove_leftovers, writing
+from d2_plugin.durable import make_folder, remove_leftovers, replacing
 from d2_plugin.errors import D2Error
 from d2_plugin.extras import import_av
 from d2_plugin.locks import one_of_many
@@ -58,8 +56,7 @@ def write_video(path: Path, form: Format, fps: float, quality: int = 18) -> Iter
     if path.suffix.lower() != f".{form}":  # a typing error must not replace another kind of file
         raise D2Error(f"a video of format {form} needs a name that ends so, got {path.name}: mend the name or --format")
     folder, av = make_folder(path.parent), import_av("writing videos")
-    unfinished = path.with_name(f".{secrets.token_hex(8)}{LEFTOVER}")
-    with one_of_many(folder, lambda: remove_leftovers(folder, below=False)), writing(path):
+    with one_of_many(folder, lambda: remove_leftovers(folder, below=False)), replacing(path) as unfinished:
         try:
             encoder = _Encoder(av, unfinished, form, _rate(fps), quality)
             try:
@@ -68,7 +65,6 @@ def write_video(path: Path, form: Format, fps: float, quality: int = 18) -> Iter
             finally:
                 with suppress(av.error.FFmpegError, OSError):  # the earlier error is the one that is reported
                     encoder.container.close()
-            os.replace(unfinished, path)
         except (D2Error, OSError):
             raise
         except (av.error.FFmpegError, OverflowError) as error:
@@ -76,14 +72,9 @@ def write_video(path: Path, form: Format, fps: float, quality: int = 18) -> Iter
                 f"cannot write the video {path} ({said(error)}): choose other --width, --height or --fps, or another "
                 "--format"
             ) from None
-        finally:
-            with suppress(OSError):
-                unfinished.unlink(missing_ok=True)
 
 
 class _Encoder:
-    """One stream in one container."""
-
     def __init__(self, av: Any, path: Path, form: str, rate: Fraction, quality: int) -> None:
         self.av, self.form, self.rate, self.quality, self.count = av, form, rate, quality, 0
         self.container: Any = av.open(str(path), "w", format=form, options=CODECS[form][1])
@@ -108,7 +99,6 @@ class _Encoder:
         self.container.mux(self.stream.encode(frame))
 
     def close(self) -> None:
-        """Write what is still inside."""
         if self.stream is None:
             raise D2Error("a video without an image: choose a longer path or more frames")
         self.container.mux(self.stream.encode())

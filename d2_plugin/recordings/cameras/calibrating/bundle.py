@@ -9,7 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from d2_plugin.recordings.cameras.calibrating.features import Features, Matches, pixel_error, silent_pycolmap
+from d2_plugin.recordings.cameras.calibrating.features import (
+    Features,
+    Matches,
+    as_colmap,
+    pixel_error,
+    silent_pycolmap,
+)
 from d2_plugin.recordings.cameras.camera import pinhole, rigid
 from d2_plugin.recordings.recording import Camera
 
@@ -155,13 +161,8 @@ def _add_camera(
 ) -> None:
     """Add an image with (its number, that of its lens), and the lens where it is not there yet."""
     number, lens = numbers
-    K = camera.K
-    values = [K[0, 0], K[0, 2], K[1, 2]] if focal else [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
-    model = "SIMPLE_PINHOLE" if focal else "PINHOLE"
     if lens not in rec.cameras:
-        rec.add_camera_with_trivial_rig(
-            pycolmap.Camera(camera_id=lens, model=model, width=camera.width, height=camera.height, params=values)
-        )
+        rec.add_camera_with_trivial_rig(as_colmap(camera, lens, focal))
     image = pycolmap.Image(name=camera.name, keypoints=pixels.reshape(-1, 2), camera_id=lens, image_id=number)
     T = camera.T_camera_world
     rec.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(T[:3, :3]), T[:3, 3]))

@@ -182,13 +182,9 @@ def _ransac(
     return result
 
 
-def as_colmap(camera: Camera) -> Any:
-    """A pinhole camera as pycolmap has it; both put the centre of the first pixel at 0.5."""
-    K = camera.K
-    return silent_pycolmap("calibrating").Camera(
-        camera_id=1,
-        model="PINHOLE",
-        width=camera.width,
-        height=camera.height,
-        params=[K[0, 0], K[1, 1], K[0, 2], K[1, 2]],
-    )
+def as_colmap(camera: Camera, number: int = 1, one_focal: bool = False) -> Any:
+    """A camera as pycolmap has it, with `one_focal` length or two; both have the first pixel's centre at 0.5."""
+    (fx, fy), (cx, cy) = camera.K[[0, 1], [0, 1]], camera.K[:2, 2]
+    model, values = ("SIMPLE_PINHOLE", [fx, cx, cy]) if one_focal else ("PINHOLE", [fx, fy, cx, cy])
+    size = {"width": camera.width, "height": camera.height}
+    return import_pycolmap("calibrating", "calibration").Camera(camera_id=number, model=model, params=values, **size)

@@ -274,7 +274,6 @@ def _undetermined(given: Mapping[str, Camera], tracks: Sequence[Tracks]) -> str:
 
 
 def _rms(cameras: Mapping[str, Camera], matches: Matches, features: Mapping[str, Features]) -> float:
-    """Root mean square of Sampson's distance, pixels, as `_squares` has it."""
     squares = _squares(cameras, matches, features)
     return float(np.sqrt(squares.mean())) if len(squares) else 0.0
 

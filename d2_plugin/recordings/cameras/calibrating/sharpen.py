@@ -145,7 +145,6 @@ def _sampled(fine: Fine, places: np.ndarray) -> np.ndarray:
 
 
 def _correlation(one: np.ndarray, other: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Weighted correlation [n] of patches [n, m]."""
     a, b = (patch - (patch * weight).sum(axis=1, keepdims=True) / weight.sum() for patch in (one, other))
     squares = (a**2 * weight).sum(axis=1) * (b**2 * weight).sum(axis=1)
     return np.asarray((a * b * weight).sum(axis=1) / np.sqrt(np.maximum(squares, 1e-9)))

@@ -229,7 +229,6 @@ def _add(
 
 
 def _keys(row: np.ndarray, names: Sequence[str], cameras: Mapping[str, Camera]) -> list[tuple[str, int]]:
-    """The features (camera, index) of a track in `cameras`."""
     return [(name, index) for name, index in zip(names, row.tolist(), strict=True) if index >= 0 and name in cameras]
 
 

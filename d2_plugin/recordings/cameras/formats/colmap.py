@@ -198,7 +198,6 @@ def read_points(folder: Path) -> ColmapPoints:
 
 
 def _by_number(path: Path, pairs: Iterable[tuple[int, Any]]) -> dict[int, Any]:
-    """Entries by their number, which no two share."""
     entries: dict[int, Any] = {}
     for number, entry in pairs:
         if number in entries:
@@ -230,8 +229,6 @@ def _parse(path: Path, binary: Any, text: Any) -> Iterator[Any]:
 
 
 class _Cursor:
-    """Reads little-endian numbers one after the other."""
-
     def __init__(self, data: bytes) -> None:
         self.data, self.place = data, 0
 

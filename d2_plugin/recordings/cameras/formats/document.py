@@ -11,7 +11,8 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from d2_plugin.errors import D2Error, missing_extra
+from d2_plugin.errors import D2Error
+from d2_plugin.extras import imported
 from d2_plugin.reading import DEEPEST, check_slow, field, parse_json, parse_toml, parsing, read_bytes, read_text, said
 from d2_plugin.recordings.cameras.camera import LARGEST_NUMBER
 from d2_plugin.values import Range, shown
@@ -148,10 +149,7 @@ def size_of(table: Mapping[str, Any], key: str, place: str) -> tuple[int, int]:
 
 def parse_yaml(text: str, place: str) -> Any:
     """Lists, tables and words of YAML, without types (a number is a word) and aliases, which can unfold to any size."""
-    try:
-        import yaml
-    except ImportError:
-        raise missing_extra("PyYAML", "calibration", f"reading {place}") from None
+    yaml = imported("yaml", "PyYAML", "calibration", f"reading {place}")
     check_slow(text, place, CORRECT)
     open_ones: list[list[Any]] = [[]]
     with parsing(place, CORRECT):
