@@ -46,11 +46,10 @@ class Motion(ImageHook):
 
         quarter = ORDER[context.step // self.config.every % len(ORDER)]
         pair = context.prior.underway(view, context.instants(view.camera), quarter)
-        if pair is None or pair[1].maps.codes.colors is None:
+        if pair is None:
             return None
         between, prior = pair[0], pair[1].maps.codes
-        drawn = self.drawn(context.backbone, between)
-        if drawn is None:
+        if prior.colors is None or (drawn := self.drawn(context.backbone, between)) is None:
             return None
         shown, labels = (part.to(view.K.device, non_blocking=True) for part in (prior.colors, prior.labels))
         image = shown.to(drawn[0]) / 255

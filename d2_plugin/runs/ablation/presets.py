@@ -91,7 +91,6 @@ PUBLISHED: dict[str, tuple[str, dict[str, float]]] = {
             "full": 27.2302,
         },
     ),
-    "parallax": ("no_parallax", "full"),
     "pruning": (
         "tab:pruning_criteria: actor5_6 of ENeRF-Outdoor, 4 views",
         {"no_pruning": 21.1874, "opacity_only": 21.5663, "depth_only": 21.9076, "full": 22.2082},
