@@ -13,13 +13,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Optional, cast
 
 from d2_plugin.errors import D2Error, unknown_name
-from d2_plugin.hooks import HOOKS
-from d2_plugin.hooks.densify import DensifyConfig
-from d2_plugin.hooks.depth_loss import DepthLossConfig
-from d2_plugin.hooks.motion import MotionConfig
-from d2_plugin.hooks.parallax import ParallaxConfig
+from d2_plugin.hooks import HOOKS, DensifyConfig, DepthLossConfig, MotionConfig, ParallaxConfig, PruneConfig
 from d2_plugin.hooks.prior import Belief
-from d2_plugin.hooks.prune import PruneConfig
 from d2_plugin.reading import NoSuchFile, read_toml
 from d2_plugin.settings import FORMAT, NONE, AtLeastOne, Count, Range, Seed, Settings, of_this_format
 from d2_plugin.values import checked_arguments

@@ -166,7 +166,6 @@ class ImageHook(Hook):
 
     def term(self, context: Context, view: View) -> Tensor | None:
         """The loss of one view of the present step; None where nothing is known of it."""
-        raise NotImplementedError
 
     def drawn(self, backbone: Backbone, view: View) -> tuple[Tensor, Tensor] | None:
         """What the backbone shows, with gradients: RGB [H, W, 3], and the share [H, W, 1] that a background of its

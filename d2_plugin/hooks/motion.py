@@ -17,7 +17,7 @@ from torch import Tensor
 
 from d2_plugin.hooks.hook import Context, HookConfig, ImageHook
 from d2_plugin.protocol import Label, View
-from d2_plugin.settings import Range, Share
+from d2_plugin.settings import Range
 
 ORDER = (2, 1, 2, 3)
 """Quarters of the way in turn: halfway, farthest from what is trained, twice as often."""
@@ -29,8 +29,6 @@ class MotionConfig(HookConfig):
 
     weight: Annotated[float, Range(0, 1e6)] = 1.0
     """Weight beside the trainer's own photometric loss."""
-    ssim_weight: Share = 0.2
-    """Share of D-SSIM in it; the rest is L1."""
     insert: bool = True
     """Whether `densify` also inserts what moves at instants halfway."""
 
@@ -55,4 +53,4 @@ class Motion(ImageHook):
         image = shown.to(drawn[0]) / 255
         color = drawn[0] + drawn[1] * image  # a background that is not known shows what the image shows
         moved = (labels != Label.CONFLICT)[..., None]
-        return photometric_loss(color, torch.where(moved, image, color.detach()), self.config.ssim_weight)
+        return photometric_loss(color, torch.where(moved, image, color.detach()))

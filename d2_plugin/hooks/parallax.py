@@ -8,7 +8,6 @@ before it, or what moves and may.
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, NamedTuple
@@ -74,15 +73,8 @@ class Side(NamedTuple):
     """Where its image moves, bool [H, W]; none where that is not known."""
 
 
-class Sight(NamedTuple):
-    """What of a view is seen on the way to another camera."""
-
-    aside: View
-    """The place on the way."""
-    pixels: Tensor
-    """[K] int32: row * width + column in the view itself."""
-    places: Tensor
-    """[2, K]: where the surfaces of these pixels are seen from aside, in pixels."""
+Sight = tuple[View, Tensor, Tensor]
+"""A place on the way, the pixels [K] (int32, row * width + column) of a view that are seen there, and where, [2, K]."""
 
 
 class Parallax(ImageHook):
@@ -92,7 +84,7 @@ class Parallax(ImageHook):
 
     def __init__(self, config: ParallaxConfig) -> None:
         super().__init__(config)
-        self._sights: OrderedDict[tuple[str, int, str, float, int], Sight] = OrderedDict()
+        self._sights: dict[tuple[str, int, str, float, int], Sight] = {}
         self._bytes = 0
         self._moving = MovingPixels()
 
@@ -101,13 +93,14 @@ class Parallax(ImageHook):
         from d2_plugin.gaussians.photometric import photometric_loss  # a trainer without this hook needs none of it
 
         sight, prior = self._sight(context, view), context.prior(view)
-        if sight is None or prior is None or prior.colors is None or len(sight.pixels) < LEAST * prior.depth.numel():
+        if sight is None or prior is None or prior.colors is None or len(sight[1]) < LEAST * prior.depth.numel():
             return None
-        drawn = self.drawn(context.backbone, sight.aside)
+        aside, pixels, places = sight[0], sight[1].long(), sight[2]
+        drawn = self.drawn(context.backbone, aside)
         if drawn is None:
             return None
-        image, pixels = prior.colors.to(drawn[0]) / 255, sight.pixels.long()
-        trained, seen = image.view(-1, 3), _sampled(torch.cat(drawn, -1), sight.places)
+        image = prior.colors.to(drawn[0]) / 255
+        trained, seen = image.view(-1, 3), _sampled(torch.cat(drawn, -1), places)
         # A background that is not known shows what the image shows.
         shown = trained.index_copy(0, pixels, seen[:, :3] + seen[:, 3:] * trained[pixels])
         return photometric_loss(shown.view_as(image), image)
@@ -123,7 +116,8 @@ class Parallax(ImageHook):
         # What moves is known better while instants are seen for the first time.
         instants = min(INSTANTS, *(len(context.instants(end.camera)) for end in ends))
         key = view.camera, view.frame, other.camera, part, instants
-        if key not in self._sights:
+        sight = self._sights.get(key)
+        if sight is None:
             sides = [Side(end, prior) for end in ends if (prior := context.prior(end)) is not None]
             moving = [life.isfinite() for end in ends if (life := self._moving.intervals(end, context)) is not None]
             if len(sides) < 2:
@@ -131,12 +125,11 @@ class Parallax(ImageHook):
             if len(moving) == 2:
                 sides = [side._replace(moving=pixels) for side, pixels in zip(sides, moving)]
             aside = on_the_way(view, other, part)
-            self._sights[key] = Sight(aside, *in_sight(aside, *sides))
-            self._bytes += _bytes_of(self._sights[key])
-        self._sights.move_to_end(key)
-        while self._bytes > KEPT and len(self._sights) > 1:
-            self._bytes -= _bytes_of(self._sights.popitem(last=False)[1])
-        return self._sights[key]
+            sight = aside, *in_sight(aside, *sides)
+            self._bytes += 12 * len(sight[1])
+            if self._bytes <= KEPT:
+                self._sights[key] = sight
+        return sight
 
 
 def on_the_way(view: View, other: View, part: float) -> View:
@@ -158,19 +151,19 @@ def in_sight(aside: View, own: Side, other: Side) -> tuple[Tensor, Tensor]:
     """
     pixels, surface = _surface(own.view, own.prior)
     _, surface_beside = _surface(other.view, other.prior)
-    counterpart, met = _counterpart(surface, other.view, other.prior)
+    places, _, met = _projected(other.view, surface)
+    there = _index(other.view, places)  # what the other camera has in the same direction
+    counterpart = _back_projected(other.view, there, other.prior.depth)
     places, depth, inside = _projected(aside, surface)
     same = (_projected(aside, counterpart)[0] - places).norm(dim=0) < APART
     nearest = _nearest(aside, torch.cat([surface, surface_beside], 1))
     if own.moving is not None and other.moving is not None and len(depth):
         hull = _nearest_that_moves(aside, [(own.view, own.moving), (other.view, other.moving)], depth.max())
         nearest = torch.minimum(nearest, hull)
-    known = inside & met & same & (depth * HIDES < nearest[_index(aside, places)])
+    known = (
+        inside & met & other.prior.trusted.flatten()[there] & same & (depth * HIDES < nearest[_index(aside, places)])
+    )
     return pixels[known].int(), places[:, known]
-
-
-def _bytes_of(sight: Sight) -> int:
-    return sum(part.numel() * part.element_size() for part in (sight.pixels, sight.places))
 
 
 def _centre(view: View) -> Tensor:
@@ -182,13 +175,6 @@ def _surface(view: View, prior: DepthPrior) -> tuple[Tensor, Tensor]:
     """The trusted pixels [K] of a view and the world points [3, K] there."""
     pixels = torch.nonzero((prior.trusted & (prior.depth > 0)).flatten()).squeeze(1)
     return pixels, _back_projected(view, pixels, prior.depth)
-
-
-def _counterpart(points: Tensor, view: View, prior: DepthPrior) -> tuple[Tensor, Tensor]:
-    """What a view has in the pixels that world points [3, K] fall into: points [3, K], and where it has any, [K]."""
-    places, _, inside = _projected(view, points)
-    pixels = _index(view, places)
-    return _back_projected(view, pixels, prior.depth), inside & prior.trusted.flatten()[pixels]
 
 
 def _back_projected(view: View, pixels: Tensor, depth: Tensor) -> Tensor:
