@@ -14,7 +14,7 @@ from torch import Tensor
 from d2_plugin.hooks.expected import check_device, check_splats
 from d2_plugin.hooks.prior import PriorLoader
 from d2_plugin.protocol import Backbone, DepthPrior, Edit, Splats, Survey, View, call_optional
-from d2_plugin.rasterizer import rasterize, survey
+from d2_plugin.rasterizer import Render, rasterize, survey
 from d2_plugin.settings import Every, Settings, Steps
 
 log = logging.getLogger(__name__)
@@ -167,9 +167,8 @@ class ImageHook(Hook):
     def term(self, context: Context, view: View) -> Tensor | None:
         """The loss of one view of the present step; None where nothing is known of it."""
 
-    def drawn(self, backbone: Backbone, view: View) -> tuple[Tensor, Tensor] | None:
-        """What the backbone shows, with gradients: RGB [H, W, 3], and the share [H, W, 1] that a background of its
-        own would have where it does not say which. None, and a warning, where it has no colours."""
+    def drawn(self, backbone: Backbone, view: View) -> Render | None:
+        """What the backbone's Gaussians show, with gradients. None, and a warning, where it has no colours."""
         splats = backbone.slice_at(view)
         colors = call_optional(backbone, "colors", view, splats)
         if colors is None:
@@ -177,6 +176,4 @@ class ImageHook(Hook):
             log.warning("%s supervises nothing: the backbone has no `colors`, see d2_plugin.protocol.Backbone", name)
             self._colorless = True
             return None
-        render = rasterize(splats, colors, view, backbone.settings)
-        clear, whole = (1 - render.alpha)[..., None], call_optional(backbone, "behind", render, view)
-        return (render.color, clear) if whole is None else (whole.color, torch.zeros_like(clear))
+        return rasterize(splats, colors, view, backbone.settings)

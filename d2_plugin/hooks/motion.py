@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from d2_plugin.hooks.hook import Context, HookConfig, ImageHook
-from d2_plugin.protocol import Label, View
+from d2_plugin.protocol import Label, View, call_optional
 from d2_plugin.settings import Range
 
 ORDER = (2, 1, 2, 3)
@@ -50,7 +50,9 @@ class Motion(ImageHook):
         if prior.colors is None or (drawn := self.drawn(context.backbone, between)) is None:
             return None
         shown, labels = (part.to(view.K.device, non_blocking=True) for part in (prior.colors, prior.labels))
-        image = shown.to(drawn[0]) / 255
-        color = drawn[0] + drawn[1] * image  # a background that is not known shows what the image shows
+        image = shown.to(drawn.color) / 255
+        # A background that is not known shows what the image shows.
+        unknown = drawn._replace(color=drawn.color + (1 - drawn.alpha)[..., None] * image)
+        color = call_optional(context.backbone, "behind", drawn, between, default=unknown).color
         moved = (labels != Label.CONFLICT)[..., None]
         return photometric_loss(color, torch.where(moved, image, color.detach()))

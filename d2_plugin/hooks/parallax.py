@@ -99,9 +99,10 @@ class Parallax(ImageHook):
         drawn = self.drawn(context.backbone, aside)
         if drawn is None:
             return None
-        image = prior.colors.to(drawn[0]) / 255
-        trained, seen = image.view(-1, 3), _sampled(torch.cat(drawn, -1), places)
-        # A background that is not known shows what the image shows.
+        image = prior.colors.to(drawn.color) / 255
+        trained = image.view(-1, 3)
+        seen = _sampled(torch.cat([drawn.color, 1 - drawn.alpha[..., None]], -1), places)
+        # What is transparent shows what it should: a background would learn there what no camera sees of it.
         shown = trained.index_copy(0, pixels, seen[:, :3] + seen[:, 3:] * trained[pixels])
         return photometric_loss(shown.view_as(image), image)
 

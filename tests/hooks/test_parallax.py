@@ -194,6 +194,14 @@ def test_what_floats_before_a_surface_gets_fainter() -> None:
     assert model.gaussians["opacity_logits"].grad > 0
 
 
+def test_a_background_learns_nothing_from_it() -> None:
+    """It would take the colours of surfaces into directions that no camera sees: that cost one of studio 2 dB."""
+    model = make_model()
+    loss_of(make_adapter(model), [LEFT, RIGHT]).backward()
+    assert model.gaussians["base_colors"].grad.any()
+    assert model.background.constant.grad is None
+
+
 def test_it_has_the_weight_that_was_asked_for() -> None:
     adapter = make_adapter(make_model())
     torch.testing.assert_close(loss_of(adapter, [LEFT, RIGHT], weight=6.0), 3 * loss_of(adapter, [LEFT, RIGHT]))
