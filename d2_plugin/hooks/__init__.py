@@ -25,7 +25,7 @@ from typing import NamedTuple
 
 from d2_plugin.hooks.densify import Densify, DensifyConfig
 from d2_plugin.hooks.depth_loss import DepthLoss, DepthLossConfig
-from d2_plugin.hooks.hook import Context, Hook, HookConfig, Surveyed, Window
+from d2_plugin.hooks.hook import Context, Hook, HookConfig
 from d2_plugin.hooks.motion import Motion, MotionConfig
 from d2_plugin.hooks.parallax import Parallax, ParallaxConfig
 from d2_plugin.hooks.prior import PriorLoader
@@ -34,22 +34,14 @@ from d2_plugin.hooks.prune import Prune, PruneConfig
 __all__ = [
     "HOOKS",
     "Context",
-    "Densify",
     "DensifyConfig",
-    "DepthLoss",
     "DepthLossConfig",
     "Hook",
     "HookConfig",
-    "HookRow",
-    "Motion",
     "MotionConfig",
-    "Parallax",
     "ParallaxConfig",
     "PriorLoader",
-    "Prune",
     "PruneConfig",
-    "Surveyed",
-    "Window",
 ]
 
 

@@ -2,8 +2,7 @@
 
 Images alone say nothing of the views between the cameras: Gaussians at a wrong depth can reproduce every trained image
 and stand before everything else in all others. A surface on which two cameras agree is in sight on the way from one to
-the other as well, in the colours that they saw, unless something hides it there: what either of them knows to stand
-before it, or what moves and may.
+the other as well, in the colours that they saw, unless something known, or something that moves, hides it.
 """
 
 from __future__ import annotations
