@@ -13,11 +13,13 @@ from torch import Tensor
 
 from d2_plugin.hooks.expected import check_splats
 from d2_plugin.hooks.hook import Context, Hook, HookConfig, Surveyed, steps_between_evaluations
-from d2_plugin.hooks.rendered_depth import relative_discrepancy, rendered_depth
 from d2_plugin.protocol import DepthPrior, Edit, Label, Points, Splats, View
 from d2_plugin.settings import Count, Every, Positive, Range, Share, Steps
 
 log = logging.getLogger(__name__)
+
+EPSILON = 1e-8
+"""The paper's epsilon: only keeps 0/0 away. What bounds the gradient of a depth is tau_v, not epsilon."""
 
 SIGMAS = 2.5
 """A pixel also counts as under-reconstructed only beyond this many standard deviations of its depth."""
@@ -82,6 +84,22 @@ class DensifyConfig(HookConfig):
         start = max(1, min(every, iterations // 40))
         budget = max(10 * iterations, 200 * every)
         return cls(start=start, stop=max(iterations // 2, every + 1), every=every, budget_per_view=budget)
+
+
+def rendered_depth(depth_sum: Tensor, alpha: Tensor, tau_v: float) -> tuple[Tensor, Tensor]:
+    """D_hat = sum w z / (A + eps) and M^r = [A > tau_v], both [H, W].
+
+    Where M^r is 0 the depth is 0 with no gradient; the denominator is made safe before the division, since a mask
+    applied afterwards would turn inf * 0 into NaN.
+    """
+    valid = alpha > tau_v
+    safe = torch.where(valid, alpha + EPSILON, torch.ones_like(alpha))
+    return torch.where(valid, depth_sum, torch.zeros_like(depth_sum)) / safe, valid
+
+
+def relative_discrepancy(depth: Tensor, prior: Tensor) -> Tensor:
+    """delta = |D_hat - D*| / (D* + eps), [H, W]; meaningful where the prior has support (D* > 0)."""
+    return torch.abs(depth - prior) / (prior + EPSILON)
 
 
 def under_reconstructed(depth: Tensor, valid: Tensor, prior: Tensor, support: Tensor, tau_u: float | Tensor) -> Tensor:

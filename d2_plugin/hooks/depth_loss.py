@@ -14,11 +14,11 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
+from d2_plugin.hooks.densify import EPSILON, rendered_depth
 from d2_plugin.hooks.expected import check_device
 from d2_plugin.hooks.hook import Context, Hook, HookConfig
 from d2_plugin.hooks.native_depth_loss import can_compare, native_depth_loss
 from d2_plugin.hooks.prior import FAR, NEAR, KnownMaps
-from d2_plugin.hooks.rendered_depth import EPSILON, rendered_depth
 from d2_plugin.protocol import View, call_optional
 from d2_plugin.rasterizer import rasterize
 from d2_plugin.settings import Range, Share

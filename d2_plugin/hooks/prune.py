@@ -9,8 +9,8 @@ from typing import Annotated, NamedTuple
 import torch
 from torch import Tensor
 
+from d2_plugin.hooks.densify import EPSILON
 from d2_plugin.hooks.hook import Context, Hook, HookConfig, Surveyed, steps_between_evaluations
-from d2_plugin.hooks.rendered_depth import EPSILON
 from d2_plugin.protocol import Edit, View
 from d2_plugin.settings import Every, Range, Share, Steps
 

@@ -16,10 +16,9 @@ from torch import Tensor
 from d2_plugin.hooks import depth_loss as module
 from d2_plugin.hooks import native_depth_loss
 from d2_plugin.hooks import prior as loading
-from d2_plugin.hooks.densify import Densify, DensifyConfig, under_reconstructed
+from d2_plugin.hooks.densify import Densify, DensifyConfig, rendered_depth, under_reconstructed
 from d2_plugin.hooks.depth_loss import DepthLossConfig, supervision
 from d2_plugin.hooks.prior import FAR, JUDGES, KnownMaps, PriorLoader
-from d2_plugin.hooks.rendered_depth import rendered_depth
 from d2_plugin.protocol import DepthPrior, Label, View
 
 PAPER = DepthLossConfig(tau_v=0.5, epsilon=0.01, sigma_full=0.05, opaque=0)

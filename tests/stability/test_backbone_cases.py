@@ -28,8 +28,8 @@ from d2_plugin.backbones.model import SplatModel
 from d2_plugin.backbones.starting import nearest_neighbour_scales
 from d2_plugin.config import DensifyConfig, DepthLossConfig, PruneConfig
 from d2_plugin.gaussians.photometric import photometric_loss
+from d2_plugin.hooks.densify import EPSILON, rendered_depth
 from d2_plugin.hooks.depth_loss import charbonnier
-from d2_plugin.hooks.rendered_depth import EPSILON, rendered_depth
 from d2_plugin.protocol import DepthPrior, Label
 
 DEPTH_LOSS = D2Config(depth_loss=DepthLossConfig(start=1, every=1))
