@@ -225,8 +225,13 @@ class Run:
 
     def _attach(self, model: object) -> D2Hooks:
         adapter: Any = registry.load(registry.ADAPTERS, self.settings.backbone)
-        config = hook_config(self.settings, self.priors)
+        config: Any = hook_config(self.settings, self.priors)
         config = config if self.trials is None else replace(config, believe=self.trials["choice"])
+        plan, alone = self.scene.plan, config.believe == "stereo" or self.scene.prior_settings.variant == "mvs"
+        filled = not alone and (plan.uses("monocular") or bool(plan.multiview))
+        if filled and "parallax" not in self.settings.overrides:
+            # It gains nothing where another depth fills what stereo leaves empty (docs/evidence.md).
+            config = replace(config, parallax=None)
         write_text(self.folder / "d2.toml", config.to_toml())
         guidance, priors = self.guidance, self.priors
         others = {} if guidance is None else guidance.hooks(self.scene, self._points(), priors)

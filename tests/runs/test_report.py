@@ -52,7 +52,7 @@ def write_run(folder: Path, psnr: float | None = 25.0, **more: object) -> Path:
         "test": None if psnr is None else {"psnr": psnr, "ssim1": 0.8},
         "seconds": {"priors": 60.0, "train": 30.0},
         **{"gaussians": 1234, "iterations": 500, "recording": "den", "train_cameras": ["a", "b"], "backbone": "yang4d"},
-        "hooks": ["prior", "densify", "prune", "depth_loss", "motion"],
+        "hooks": ["prior", "densify", "prune", "depth_loss", "motion", "parallax"],
         "made": {"device": "a CPU", "threads": 2, "version": "1", "commit": "abc", "torch": "2"},
         **more,
     }

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from tiny import make_model
 
 from d2_plugin.config import D2Config
 from d2_plugin.hooks.prior import PriorLoader, believed
@@ -165,6 +166,31 @@ def test_the_user_may_choose_and_then_nothing_is_tried(
     run.prepare()
     assert run.trials is None
     assert not tried
+
+
+@pytest.mark.parametrize(
+    ("choice", "tables", "on"),
+    [
+        ("stereo", {}, True),
+        ("all", {}, False),
+        ("all", {"parallax": {}}, True),
+        ("all", {"priors": {"variant": "mvs"}}, True),
+    ],
+)
+def test_parallax_is_left_out_where_another_depth_fills_what_stereo_leaves_empty(
+    settings: RunSettings,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    choice: str,
+    tables: dict[str, Any],
+    on: bool,
+) -> None:
+    run = run_of(replace(settings, overrides=tables), tmp_path / "run")
+    run.trials = {"choice": choice}
+    monkeypatch.setattr("d2_plugin.runs.run.D2Hooks", lambda config, *_, **__: config)
+    config = run._attach(make_model())
+    assert (config.parallax is not None) is on
+    assert config.motion is not None
 
 
 def test_one_of_two_cameras_would_train_alone_so_two_cameras_get_no_trial(room: Path, tmp_path: Path) -> None:
