@@ -160,9 +160,8 @@ def in_sight(aside: View, own: Side, other: Side) -> tuple[Tensor, Tensor]:
     if own.moving is not None and other.moving is not None and len(depth):
         hull = _nearest_that_moves(aside, [(own.view, own.moving), (other.view, other.moving)], depth.max())
         nearest = torch.minimum(nearest, hull)
-    known = (
-        inside & met & other.prior.trusted.flatten()[there] & same & (depth * HIDES < nearest[_index(aside, places)])
-    )
+    hidden = depth * HIDES >= nearest[_index(aside, places)]
+    known = inside & met & other.prior.trusted.flatten()[there] & same & ~hidden
     return pixels[known].int(), places[:, known]
 
 

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from d2_plugin.durable import make_folder
 from d2_plugin.errors import D2Error
+from d2_plugin.hooks.densify import rendered_depth
 from d2_plugin.progress import progress_bar
 from d2_plugin.recordings.images import write_png
 from d2_plugin.recordings.recording import Recording
@@ -47,14 +48,9 @@ def renderer(model: Any, recording: Recording, device: torch.device | str) -> Re
     def render(camera: str, frame: int) -> tuple[Tensor, Tensor]:
         view = make_view(recording, camera, frame, device)
         color, depth_sum, alpha = (part.cpu() for part in model.render(view)[:3])
-        return color.clamp(0, 1), rendered_depth(depth_sum, alpha)
+        return color.clamp(0, 1), rendered_depth(depth_sum, alpha, RENDERED_ALPHA)[0]
 
     return render
-
-
-def rendered_depth(depth_sum: Tensor, alpha: Tensor) -> Tensor:
-    """Mean depth [H, W], 0 where too little is opaque."""
-    return torch.where(alpha > RENDERED_ALPHA, depth_sum / alpha.clamp(min=RENDERED_ALPHA), torch.zeros_like(alpha))
 
 
 def evaluate_scene(model: Any, scene: Scene, device: torch.device | str, images: Path | None = None) -> dict[str, Any]:

@@ -12,9 +12,10 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from d2_plugin.hooks.densify import rendered_depth
 from d2_plugin.protocol import Splats, View, call_optional
 from d2_plugin.rasterizer import rasterize
-from d2_plugin.runs.evaluation import rendered_depth
+from d2_plugin.runs.evaluation import RENDERED_ALPHA
 
 GREY = 0.6
 """Brightness of Gaussians whose adapter knows no colours."""
@@ -51,4 +52,4 @@ def render_view(backbone: Any, view: View, marked: Tensor | None = None, scale: 
     if marked is None:
         render = call_optional(backbone, "behind", render, view, default=render)
     color, depth_sum, alpha = (part.cpu() for part in render[:3])
-    return RenderedView(color.clamp(0, 1), rendered_depth(depth_sum, alpha), alpha, splats)
+    return RenderedView(color.clamp(0, 1), rendered_depth(depth_sum, alpha, RENDERED_ALPHA)[0], alpha, splats)
