@@ -89,24 +89,27 @@ def test_what_one_view_inserts_another_does_not_insert_again() -> None:
     assert len(proposed(views, spacing=4.0).positions) < 0.7 * apart
 
 
-def test_the_first_evaluation_looks_through_every_camera_seen_so_far() -> None:
-    looked: list[set[str]] = []
+@pytest.mark.parametrize(("usual", "first"), [(1, 3), (2, 5)])
+def test_the_first_evaluation_looks_through_every_camera_and_at_more_views(usual: int, first: int) -> None:
+    looked: list[set[tuple[str, int]]] = []
 
     class Spied(TinyStore):
         def prior(self, camera: str, frame: int) -> DepthPrior:
-            looked[-1].add(camera)
+            looked[-1].add((camera, frame))
             return super().prior(camera, frame)
 
-    config = replace(
-        ALL_HOOKS, views_per_evaluation=1, prune=None, depth_loss=None, densify=DensifyConfig(start=6, every=2, stop=9)
-    )
+    densify = DensifyConfig(start=6, every=2, stop=9, lifetime=None)
+    config = replace(ALL_HOOKS, views_per_evaluation=usual, prune=None, depth_loss=None, densify=densify)
     d2 = D2Hooks(config, make_adapter(make_model()), Spied())
     views = make_views()
     for step in range(1, 9):
         d2.loss(step, views[(step - 1) % len(views)])
         looked.append(set())
         d2.step(step)
-    assert looked[:6] == [set()] * 5 + [{"cam0", "cam1", "cam2"}]
+    assert looked[:5] == [set()] * 5
+    assert len(looked[5]) == first
+    assert {camera for camera, _ in looked[5]} == {"cam0", "cam1", "cam2"}
+    assert len(looked[7]) <= usual  # those that are kept are not read again
 
 
 @given(start=st.integers(0, 50), every=st.integers(1, 20), length=st.integers(0, 60))
