@@ -34,14 +34,7 @@ from d2_plugin.runs.saved import (
 )
 from d2_plugin.runs.scene import Guidance, Scene
 from d2_plugin.runs.settings import HOOK_NAMES, RunSettings, check, hook_config, hooks_in_use
-from d2_plugin.runs.start import (
-    TimedPoints,
-    TrainingFrames,
-    begin_with_exposures,
-    initial_points,
-    scene_extent,
-    triangulated_points,
-)
+from d2_plugin.runs.start import TimedPoints, triangulated_points
 from d2_plugin.store.store import PriorStore
 from d2_plugin.values import checked_arguments
 
@@ -194,27 +187,12 @@ class Run:
 
     def _trainer(self, triangulated: TimedPoints, attach: bool = True) -> Any:
         """A new trainer of the backbone, with hooks where the run has some and `attach` allows it."""
-        backbone: Any = registry.load(registry.BACKBONES, self.settings.backbone)
         self.scene = self.scene.with_points(triangulated, self.settings)
-        recording, cameras = self.scene.recording, self.scene.train_cameras
-        extent = scene_extent(recording, cameras, triangulated.positions)
+        start = triangulated
         if self.guidance is not None and attach:
-            triangulated = self.guidance.start(self.scene, triangulated, self.priors)
-        start = initial_points(recording, cameras, triangulated, extent, self.settings.seed)
-        # What the scene needs, that alone: a backbone of somebody else's may not know the name.
-        needed = {"appearance": True} if attach and self.scene.plan.uses("appearance") else {}
-        model = backbone.create(
-            *start.tensors(self.settings.device),
-            extent=extent.radius,
-            duration=recording.seconds(recording.frames[-1]),
-            temporal=self.scene.plan.uses("temporal"),
-            settings=needed | dict(self.settings.overrides.get("backbone", {})),
-        )
-        begin_with_exposures(model, recording, cameras, self.scene.test_cameras)
-        training = backbone.TrainSettings(iterations=self.settings.iterations, seed=self.settings.seed)
-        weight = self.settings.background_weight
-        images = TrainingFrames(recording, cameras, self.settings.device, background_weight=weight)
-        return backbone.Trainer(model, images, training, self._attach if attach and self.uses_prior else None)
+            start = self.guidance.start(self.scene, triangulated, self.priors)
+        hooks = self._attach if attach and self.uses_prior else None
+        return self.scene.trainer(self.settings, triangulated, start, hooks, appearance=attach)
 
     def trained(self) -> Any:
         """The trainer at the last checkpoint, without hooks or a look at the prior: the checkpoint says it all."""

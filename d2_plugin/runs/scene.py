@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
+from d2_plugin import registry
 from d2_plugin.errors import D2Error, refuse_unknown
 from d2_plugin.hooks import Hook
 from d2_plugin.priors.settings import PriorSettings
@@ -15,7 +16,7 @@ from d2_plugin.recordings.cameras.check import check_background_weight, check_re
 from d2_plugin.recordings.checks.memory import check_memory
 from d2_plugin.runs.plan import ScenePlan, appearance_decision, plan_scene
 from d2_plugin.runs.settings import RunSettings, hooks_in_use, prior_settings
-from d2_plugin.runs.start import TimedPoints
+from d2_plugin.runs.start import TimedPoints, TrainingFrames, begin_with_exposures, initial_points, scene_extent
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,6 +75,39 @@ class Scene:
         decision = appearance_decision(self.recording, self.train_cameras, points.positions, points.times)
         plan = self.plan.with_decision(decision).override(**settings.overrides.get("plan", {}))
         return replace(self, plan=plan)
+
+    def trainer(
+        self,
+        settings: RunSettings,
+        sparse: TimedPoints,
+        start: TimedPoints,
+        attach: Callable[[Any], Any] | None = None,
+        appearance: bool = True,
+    ) -> Any:
+        """A new trainer of the run's backbone on the training cameras.
+
+        Args:
+            sparse: the triangulated points, by which the extent of the scene is known.
+            start: what Gaussians start from, filled up with random points.
+            attach: makes the hooks of a model; None for none.
+            appearance: whether cameras learn a change of colour where the plan says so.
+        """
+        backbone: Any = registry.load(registry.BACKBONES, settings.backbone)
+        recording, cameras = self.recording, self.train_cameras
+        extent = scene_extent(recording, cameras, sparse.positions)
+        # What the scene needs, that alone: a backbone of somebody else's may not know the name.
+        needed = {"appearance": True} if appearance and self.plan.uses("appearance") else {}
+        model = backbone.create(
+            *initial_points(recording, cameras, start, extent, settings.seed).tensors(settings.device),
+            extent=extent.radius,
+            duration=recording.seconds(recording.frames[-1]),
+            temporal=self.plan.uses("temporal"),
+            settings=needed | dict(settings.overrides.get("backbone", {})),
+        )
+        begin_with_exposures(model, recording, cameras, self.test_cameras)
+        images = TrainingFrames(recording, cameras, settings.device, settings.background_weight)
+        training = backbone.TrainSettings(iterations=settings.iterations, seed=settings.seed)
+        return backbone.Trainer(model, images, training, attach)
 
 
 class Guidance(Protocol):

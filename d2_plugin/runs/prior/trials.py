@@ -17,7 +17,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -25,24 +25,16 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from d2_plugin import registry
-from d2_plugin.config import D2Config
 from d2_plugin.durable import CannotWrite, write_table
 from d2_plugin.hooks.prior import Belief, Store
 from d2_plugin.plugin import D2Hooks
 from d2_plugin.progress import progress_bar
 from d2_plugin.protocol import DepthPrior
-from d2_plugin.recordings import Recording, open_recording
+from d2_plugin.recordings import open_recording
 from d2_plugin.runs.metrics import psnr, ssim_range1
 from d2_plugin.runs.scene import Scene
 from d2_plugin.runs.settings import HOOK_NAMES, RunSettings, hook_config
-from d2_plugin.runs.start import (
-    TimedPoints,
-    TrainingFrames,
-    begin_with_exposures,
-    initial_points,
-    make_view,
-    scene_extent,
-)
+from d2_plugin.runs.start import TimedPoints, make_view
 from d2_plugin.store.store import TRIALS, PriorStore
 
 LEAST_ITERATIONS = 300
@@ -164,7 +156,6 @@ class _Trial:
     scene: Scene
     points: TimedPoints
     store: Store
-    recording: Recording
 
     @classmethod
     def of(cls, settings: RunSettings, scene: Scene, points: TimedPoints, store: PriorStore) -> _Trial:
@@ -180,49 +171,30 @@ class _Trial:
             frames=sorted({frames[round(place)] for place in places}),
             downscale=settings.downscale * factor,
         )
-        small = SmallStore(store, factor)
-        return cls(replace(settings, iterations=STEPS), scene.with_points(points, settings), points, small, recording)
+        scene = replace(scene.with_points(points, settings), recording=recording, test_cameras=())
+        return cls(replace(settings, iterations=STEPS), scene, points, SmallStore(store, factor))
 
     def model(self, cameras: Sequence[str], belief: Belief) -> Any:
-        """A model that some of the cameras trained."""
-        settings, recording = self.settings, self.recording
-        backbone: Any = registry.load(registry.BACKBONES, settings.backbone)
-        extent = scene_extent(recording, cameras, self.points.positions)
-        start = initial_points(recording, cameras, self.points, extent, settings.seed)
-        needed = {"appearance": True} if self.scene.plan.uses("appearance") else {}
-        model = backbone.create(
-            *start.tensors(settings.device),
-            extent=extent.radius,
-            duration=recording.seconds(recording.frames[-1]),
-            temporal=self.scene.plan.uses("temporal"),
-            settings=needed | dict(settings.overrides.get("backbone", {})),
+        """A model that some of the cameras trained, in too few steps to gather the evidence that pruning takes."""
+        config: Any = hook_config(self.settings, Path())
+        config = replace(config, believe=belief, prune=None, parallax=None)
+        if config.densify is not None:
+            config = replace(config, densify=replace(config.densify, every=STEPS // EVALUATIONS))
+        adapter: Any = registry.load(registry.ADAPTERS, self.settings.backbone)
+        scene = replace(self.scene, train_cameras=tuple(cameras))
+        trainer = scene.trainer(
+            self.settings, self.points, self.points, lambda model: D2Hooks(config, adapter(model), self.store)
         )
-        begin_with_exposures(model, recording, cameras, ())
-        images = TrainingFrames(recording, cameras, settings.device, background_weight=settings.background_weight)
-        training = backbone.TrainSettings(iterations=STEPS, seed=settings.seed)
-        config = replace(self._config(), believe=belief)
-        trainer = backbone.Trainer(model, images, training, lambda model: self._attach(model, config))
         trainer.run()
         return trainer.model
-
-    def _config(self) -> D2Config:
-        """The run's hooks with schedules of a trial, which is too short to gather the evidence that pruning takes."""
-        config: Any = replace(cast(Any, hook_config(self.settings, Path())), prune=None, parallax=None)
-        if config.densify is None:
-            return config
-        return replace(config, densify=replace(config.densify, every=STEPS // EVALUATIONS))
-
-    def _attach(self, model: Any, config: D2Config) -> D2Hooks:
-        adapter: Any = registry.load(registry.ADAPTERS, self.settings.backbone)
-        return D2Hooks(config, adapter(model), self.store)
 
     @torch.no_grad()
     def score(self, model: Any, camera: str) -> Score:
         """How well a model predicts a camera."""
         scores = []
-        for frame in self.recording.frames:
-            truth = torch.from_numpy(self.recording.image(camera, frame)).float() / 255
-            view = make_view(self.recording, camera, frame, self.settings.device)
+        for frame in self.scene.recording.frames:
+            truth = torch.from_numpy(self.scene.recording.image(camera, frame)).float() / 255
+            view = make_view(self.scene.recording, camera, frame, self.settings.device)
             predicted = model.render(view).color.cpu().clamp(0, 1)
             scores.append((ssim_range1(predicted, truth), psnr(predicted, truth)))
         return Score(*np.mean(scores, axis=0).tolist())
