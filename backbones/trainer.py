@@ -37,7 +37,6 @@ class Model(Protocol):
 class Hooks(Protocol):
     """What the loop needs of D2."""
 
-    def expect(self, cameras: Sequence[View]) -> None: ...
     def loss(self, step: int, views: Sequence[View]) -> Tensor | float: ...
     def prefetch(self, cameras: Sequence[View]) -> None: ...
     def step(self, step: int) -> Any: ...
@@ -87,8 +86,6 @@ class Trainer:
         self._generator = torch.Generator().manual_seed(settings.seed)
         self._queue: list[int] = []
         self.d2 = attach(model) if attach else None  # D2, line 1: after the optimizer exists
-        if self.d2 is not None:
-            self.d2.expect(frames.views)  # optional: all that will be trained on
 
     def run(self, until: int | None = None, on_step: Callable[[int, float], None] | None = None) -> None:
         """Train up to and including step `until` (default: all); `on_step(step, loss)` reports each one."""

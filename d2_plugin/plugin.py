@@ -46,10 +46,6 @@ from d2_plugin.values import checked_arguments, fitting
 
 _log = logging.getLogger(__name__)
 
-FIRST = 2.5
-"""How many times as many views the first evaluation looks at: what it does not insert the trainer's own Gaussians make
-up for, at other depths."""
-
 if hasattr(os, "register_at_fork"):
     # OpenMP's threads are not there after a fork, and a child that used them would wait for them for ever.
     os.register_at_fork(after_in_child=functools.partial(torch.set_num_threads, 1))
@@ -198,7 +194,12 @@ class D2Hooks:
             return 0.0
         self._begin(step)
         batch = views if isinstance(views, (list, tuple)) else [views]
-        shown = self._shown(self.prior, batch)
+        if batch and not self.prior.named:
+            self.prior.name_by(call_optional(self.backbone, "image_name", batch[0]))
+        shown = [converted(self.backbone, camera) for camera in batch]
+        for camera, view in zip(batch, shown):
+            if self._sampler.add(view) and (image := small_image(self.backbone, camera)) is not None:
+                self.prior.images[view.camera, view.frame] = image
         context = self._context(step, shown)
         total: Tensor | float = 0.0
         for name, hook in self._due(step, ends=False):
@@ -209,15 +210,6 @@ class D2Hooks:
                 total = total + term if isinstance(total, Tensor) else term
         self._finite.remember(total, shown)
         return total
-
-    @_by_one_thread
-    def expect(self, cameras: Iterable[object]) -> None:
-        """Know the trainer's cameras before they are trained on, once the hooks are attached; for a trainer that can
-        list them: the first evaluation then inserts at instants from all of the recording."""
-        if self.prior is not None:
-            listed = list(cameras)
-            order = torch.randperm(len(listed), generator=self.generator).tolist()
-            self._shown(self.prior, [listed[i] for i in order])
 
     def prefetch(self, cameras: Iterable[object]) -> None:
         """Read the priors of the views that come next in a thread of its own; for a trainer that knows them."""
@@ -281,16 +273,6 @@ class D2Hooks:
     def __reduce__(self) -> NoReturn:
         raise D2Error("D2Hooks are neither copied nor pickled: attach new ones and give them d2.state_dict()")
 
-    def _shown(self, prior: PriorLoader, cameras: Sequence[object]) -> list[View]:
-        """What the trainer's cameras show, known from now on."""
-        if cameras and not prior.named:
-            prior.name_by(call_optional(self.backbone, "image_name", cameras[0]))
-        views = [converted(self.backbone, camera) for camera in cameras]
-        for camera, view in zip(cameras, views):
-            if self._sampler.add(view) and (image := small_image(self.backbone, camera)) is not None:
-                prior.images[view.camera, view.frame] = image
-        return views
-
     def _begin(self, step: int) -> None:
         """Give the backbone the number of the step, and notice changes that nobody reported."""
         check_step(step)
@@ -309,10 +291,9 @@ class D2Hooks:
 
     def _context(self, step: int, views: Sequence) -> Context:
         def sample() -> Sequence:
-            usual = self.config.views_per_evaluation
-            count = usual if self._evaluated else max(round(FIRST * usual), self._sampler.cameras)
+            first = 0 if self._evaluated else self._sampler.cameras
             self._evaluated = True
-            return self._sampler.sample(count, self.generator)
+            return self._sampler.sample(max(self.config.views_per_evaluation, first), self.generator)
 
         assert self.prior is not None, "a step without hooks has no context"
         known, motion = self._sampler, self.config.motion
