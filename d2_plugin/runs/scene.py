@@ -1,4 +1,4 @@
-"""A recording with its split into training and test cameras, and the plan for it."""
+"""A recording with its split into training and test cameras, the plan for it, and new trainers on it."""
 
 from __future__ import annotations
 
