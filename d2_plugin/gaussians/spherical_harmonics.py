@@ -6,6 +6,7 @@ Source: fudan-zvg/4d-gaussian-splatting sh_utils.py: coefficient (n, k) multipli
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -66,12 +67,33 @@ def colors(coefficients: Tensor, directions: Tensor, phase: Tensor | None, degre
             raise D2Error(f"colours with {time_degree} cosines in time need the phase of each Gaussian: pass it")
         waves = torch.stack([torch.cos(phase * (2 * math.pi * n)) for n in range(time_degree + 1)], -1)
         values = (waves[:, :, None] * values[:, None]).flatten(1)
-    return torch.relu((values[..., None] * coefficients).sum(1) + 0.5)
+    return not_negative((values[..., None] * coefficients).sum(1) + 0.5)
 
 
 def constant_colors(coefficients: Tensor) -> Tensor:
     """RGB [M, 3] >= 0 from coefficients [M, 1, 3], which depend on neither direction nor time."""
-    return torch.relu(SH_C0 * coefficients[:, 0] + 0.5)
+    return not_negative(SH_C0 * coefficients[:, 0] + 0.5)
+
+
+def not_negative(values: Tensor) -> Tensor:
+    """max(values, 0), any shape; below 0 a gradient that would raise a value passes, where relu has none.
+
+    With relu black is a trap: a step too long takes a colour below 0, and nothing ever leads it back.
+    """
+    result: Tensor = _NotNegative.apply(values)  # type: ignore[no-untyped-call]  # torch's
+    return result
+
+
+class _NotNegative(torch.autograd.Function):
+    @staticmethod
+    def forward(context: Any, values: Tensor) -> Tensor:
+        context.save_for_backward(values > 0)
+        return torch.relu(values)
+
+    @staticmethod
+    def backward(context: Any, *gradients: Tensor) -> Tensor:
+        (gradient,), (above,) = gradients, context.saved_tensors
+        return torch.where(above | (gradient < 0), gradient, 0)
 
 
 def coefficients_from_rgb(rgb: Tensor, degree: int, time_degree: int) -> Tensor:

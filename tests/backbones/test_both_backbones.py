@@ -311,6 +311,22 @@ def test_every_training_view_is_used_once_per_round() -> None:
     assert {(view.camera, view.frame) for view in drawn} == {(view.camera, view.frame) for view in TinyFrames().views}
 
 
+@pytest.mark.parametrize("degree", [0, 1])
+def test_black_is_no_trap(backbone: str, degree: int) -> None:
+    """A Gaussian whose colour a step took below 0 is drawn black, and finds back where the images are brighter."""
+    model = make_model(COUNT, backbone=backbone, sh_degree=degree)
+    with torch.no_grad():
+        model.gaussians["base_colors"].copy_(sh.coefficients_from_rgb(torch.full((COUNT, 3), -0.05), 0, 0))
+    view = make_views()[0]
+    for wanted, leads in ((1.0, True), (-1.0, False)):
+        splats = model.slice_at(view)
+        colors = model.colors(view, splats)
+        assert (colors == 0).all()
+        (gradient,) = torch.autograd.grad((colors - wanted).square().sum(), model.gaussians["base_colors"])
+        assert bool((gradient < 0).any()) is leads, f"towards {wanted}"
+        assert not (gradient > 0).any(), "further below 0"
+
+
 def test_colours_of_direction_and_time_train_and_grow() -> None:
     trainer = make_trainer(iterations=20, sh_degree=1, sh_time_degree=2)
     trainer.run()
