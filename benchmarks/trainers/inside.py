@@ -133,7 +133,7 @@ def score_hust4d(objects: Any, held_out: Path) -> float:
     images = sceneLoadTypeCallbacks[kind](str(held_out)).train_cameras
     arguments, _ = objects.given["scene"]
     cameras = FourDGSdataset(images, arguments[0], kind)
-    black = torch.zeros(3)
+    black = torch.zeros(3, device="cuda")  # which means the CPU where the trainer runs there
 
     def draw(camera: Any) -> Tensor:
         return render(camera, objects.model, PIPELINE, black, stage="fine", cam_type=kind)["render"]
@@ -154,7 +154,7 @@ def score_spacetime(objects: Any) -> float:
 
     def draw(camera: Any) -> Tensor:
         named = {"basicfunction": trbfunction, "GRsetting": settings, "GRzer": rasterizer}
-        return render(camera, objects.model, PIPELINE, torch.zeros(9), **named)["render"]
+        return render(camera, objects.model, PIPELINE, torch.zeros(9, device="cuda"), **named)["render"]
 
     return mean_psnr(objects.scene.getTestCameras(), draw, psnr)
 
@@ -163,7 +163,7 @@ def mean_psnr(cameras: Iterable[Any], draw: Callable[[Any], Tensor], psnr: Calla
     """Mean over cameras of the repository's own metric of its own images, clamped to 0..1, and the true ones."""
     scores = []
     for camera in cameras:
-        drawn, true = draw(camera).clamp(0, 1), camera.original_image[:3].float()
+        drawn, true = draw(camera).clamp(0, 1).cpu(), camera.original_image[:3].float().cpu()
         scores.append(float(psnr(drawn[None], true[None]).mean()))
     return sum(scores) / len(scores)
 
