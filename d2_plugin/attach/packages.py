@@ -70,10 +70,9 @@ STAND_INS = {
         {f"faiss.{name}": f"{COMPAT}.nearest:{name}" for name in ("StandardGpuResources", "GpuIndexFlatL2")},
         "the build for GPUs is not on the package index, and the trainer asks for one nearest neighbour",
     ),
-    "open3d": StandIn({}, "the trainer imports it and calls nothing of it"),
+    **dict.fromkeys(("open3d", "tkinter"), StandIn({}, "the trainer imports it and calls nothing of it")),
     "lpips": StandIn({}, "the trainer imports it and calls nothing of it while training"),
-    "nerfview": StandIn({}, "gsplat's script imports it for its viewer: give --disable_viewer"),
-    "viser": StandIn({}, "gsplat's script imports it for its viewer: give --disable_viewer"),
+    **dict.fromkeys(("nerfview", "viser"), StandIn({}, "gsplat's script needs it to be seen: give --disable_viewer")),
     "pointops2_cuda": StandIn({}, "it is built in CUDA and called for lambda_rigid > 0 alone"),
 }
 """By the name that is imported. A new one is a row here."""
@@ -192,7 +191,8 @@ def _put(original: Original) -> None:
 def needed(script: Path, conditional: bool = True) -> dict[str, str]:
     """Packages that `script` and the files of its repository import at once, and where first; from the files alone.
 
-    Imports inside functions and inside `try` wait or may fail, so they are left out, and so is the standard library.
+    Imports inside functions and inside `try` wait or may fail, so they are left out, and so is the standard library but
+    for what many machines lack of it and `STAND_INS` names.
     Those under an `if` depend on options; they are left out unless `conditional`.
     """
     packages: dict[str, str] = {}
@@ -209,7 +209,7 @@ def needed(script: Path, conditional: bool = True) -> dict[str, str]:
             top = "tensorboard" if name.startswith("torch.utils.tensorboard") else name.split(".")[0]
             if inside is not None:
                 waiting.append(inside)
-            elif top not in standard and not any((base / top).is_dir() for base in roots):
+            elif (top in STAND_INS or top not in standard) and not any((base / top).is_dir() for base in roots):
                 packages.setdefault(top, f"{file.relative_to(root)}:{line}")
     return packages
 

@@ -42,6 +42,13 @@ def test_what_a_script_needs_is_read_from_the_files_it_reaches(script: Path) -> 
     assert set(missing(script, {"absent_one.part"})) == {"absent_two"}
 
 
+def test_of_the_standard_library_what_servers_lack_is_looked_for(script: Path) -> None:
+    """4DGaussians has `from tkinter import W`, which nothing uses; Debian's and Ubuntu's Python come without it."""
+    script.write_text("import json\nfrom tkinter import W\n")
+    assert set(needed(script)) == {"tkinter"}
+    assert "tkinter" in STAND_INS
+
+
 def test_what_an_option_imports_is_stood_in_for_but_not_asked_for(script: Path, monkeypatch) -> None:
     """gsplat's script imports torch_dgx for `--backend dgx`, 4DGaussians' mmcv for `--configs`."""
     option = "    if torch.option == 'dgx':\n        import absent_four\n"
