@@ -80,7 +80,7 @@ def not_negative(values: Tensor) -> Tensor:
 
     With relu black is a trap: a step too long takes a colour below 0, and nothing ever leads it back.
     """
-    result: Tensor = _NotNegative.apply(values)  # type: ignore[no-untyped-call]  # torch's
+    result: Tensor = _NotNegative.apply(values)
     return result
 
 
