@@ -72,7 +72,7 @@ STAND_INS = {
     ),
     **dict.fromkeys(("open3d", "tkinter"), StandIn({}, "the trainer imports it and calls nothing of it")),
     "lpips": StandIn({}, "the trainer imports it and calls nothing of it while training"),
-    **dict.fromkeys(("nerfview", "viser"), StandIn({}, "gsplat's script needs it to be seen: give --disable_viewer")),
+    **dict.fromkeys(("nerfview", "viser"), StandIn({}, "gsplat's viewer asks for it: give --disable_viewer")),
     "pointops2_cuda": StandIn({}, "it is built in CUDA and called for lambda_rigid > 0 alone"),
 }
 """By the name that is imported. A new one is a row here."""
