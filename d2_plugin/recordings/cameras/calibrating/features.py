@@ -32,6 +32,7 @@ PIXEL_ERROR = 1.5  # largest distance of a match from its epipolar line, in pixe
 LONG_SIDE = 960.0
 
 LEAST_INLIERS = 0.05  # share of inliers that RANSAC looks for, at least
+MOST_TRIALS, FEW_TRIALS = 100_000, 20_000  # of RANSAC; few where matches were asked of known poses before
 
 Pair = tuple[str, str]
 Matches = dict[Pair, np.ndarray]  # two cameras -> indices [m, 2] into their lists of features
@@ -113,12 +114,12 @@ def _match(one: Features, other: Features) -> np.ndarray:
             continue
         # Unit vectors: the squared distance is 2 - 2 times the product.
         products = one.descriptors[rows] @ other.descriptors[columns].T
-        best = products.argmax(axis=1)
-        two = np.partition(products, -2, axis=1)[:, [-1, -2]]
-        near, second = (np.sqrt(np.maximum(2 - 2 * two[:, place], 0)) for place in (0, 1))
-        mutual = products.argmax(axis=0)[best] == np.arange(len(rows))
+        best = np.arange(len(rows)), products.argmax(axis=1)
+        first, mutual = products[best], products[best] == products.max(axis=0)[best[1]]
+        products[best] = -1
+        near, second = (np.sqrt(np.maximum(2 - 2 * of, 0)) for of in (first, products.max(axis=1)))
         good = mutual & (near < RATIO * second)
-        matches.append(np.stack([rows[good], columns[best[good]]], axis=1))
+        matches.append(np.stack([rows[good], columns[best[1][good]]], axis=1))
     return _distinct(np.concatenate(matches), one, other)
 
 
@@ -145,7 +146,7 @@ def verified(
         if near is not None:
             p, q = features[a].pixels[pairs[:, 0]], features[b].pixels[pairs[:, 1]]
             pairs = pairs[np.abs(sampson(cameras[a], cameras[b], p, q)) < near]
-        result = _ransac((a, b), pairs, features, cameras)
+        result = _ransac((a, b), pairs, features, cameras, MOST_TRIALS if near is None else FEW_TRIALS)
         inside = np.zeros(len(pairs), bool) if result is None else np.asarray(result["inlier_mask"], bool)
         if inside.sum() >= ENOUGH_MATCHES:
             explained[a, b] = pairs[inside]
@@ -169,7 +170,11 @@ def essential_pose(
 
 
 def _ransac(
-    pair: Pair, pairs: np.ndarray, features: Mapping[str, Features], cameras: Mapping[str, Camera]
+    pair: Pair,
+    pairs: np.ndarray,
+    features: Mapping[str, Features],
+    cameras: Mapping[str, Camera],
+    most: int = MOST_TRIALS,
 ) -> dict[str, Any] | None:
     if len(pairs) < ENOUGH_MATCHES:
         return None
@@ -177,6 +182,7 @@ def _ransac(
     one, other = (cameras[name] for name in pair)
     options = pycolmap.RANSACOptions()
     options.max_error, options.random_seed, options.min_inlier_ratio = pixel_error(one), 0, LEAST_INLIERS
+    options.max_num_trials = most
     p, q = features[pair[0]].pixels[pairs[:, 0]], features[pair[1]].pixels[pairs[:, 1]]
     result: dict[str, Any] | None = pycolmap.estimate_essential_matrix(p, q, as_colmap(one), as_colmap(other), options)
     return result
