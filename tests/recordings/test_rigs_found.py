@@ -54,6 +54,13 @@ class TestFocalLengths:
         assert worst(rig.cameras, truth)[0] < 0.3
         assert "focal length 60" in rig.verdicts()["c0"] or "focal length 59" in rig.verdicts()["c0"]
 
+    def test_are_found_where_matches_agree_with_any(self) -> None:
+        """Two views of things without false matches look right with many focal lengths: the third one tells."""
+        truth = arc(3)
+        rig = solve_features(seen_by(truth, things=250), truth, tuple(truth), focal="shared")
+        assert {round(float(camera.K[0, 0]) / 600, 2) for camera in rig.cameras.values()} == {1.0}
+        assert worst(rig.cameras, truth)[0] < 0.1
+
     def test_that_the_images_do_not_tell_are_refused(self) -> None:
         truth = arc(3, 4.0)  # hardly any angle: focal length and depth change places
         with pytest.raises(D2Error, match=r"two halves of the images disagree about|do not settle"):

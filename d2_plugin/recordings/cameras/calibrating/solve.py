@@ -49,6 +49,7 @@ LARGEST_FOCAL_DOUBT = 0.03  # share that they may differ by about a focal length
 
 FOCALS = np.geomspace(0.45, 2.4, 9)
 """Focal lengths that are tried where none is known, in longer sides of the image: 96 to 24 degrees across."""
+ALIKE = 0.98  # share of the most matches that agree with one of them, above which another one is tried as well
 
 STARTS = 2  # pairs of cameras that are tried as a start, the most promising first
 FEWEST_SEEN = 12  # points that settle a camera, at least, and as a share of those it should see
@@ -108,15 +109,17 @@ def solve_features(
 
     `wanted` are the cameras that must be settled, `corners` matches that are known beside those of descriptors.
     """
-    known = {name: replace(intrinsics[name], T_camera_world=np.eye(4)) for name in features}
+    given = {name: replace(intrinsics[name], T_camera_world=np.eye(4)) for name in features}
     matched = match_all(features)
     for pair, more in (corners or {}).items():
         matched[pair] = np.concatenate([matched[pair], more])
-    known = known if focal is None else _likely_focal(matched, features, known)
-    matches = verified(matched, features, known)
-    tracks = join_matches(matches, tuple(features))
-    bundle = _grown(matches, tracks, features, known)
-    unsettled = list(wanted) if bundle is None else [name for name in wanted if name not in bundle.cameras]
+    for known in [given] if focal is None else _likely_focals(matched, features, given):
+        matches = verified(matched, features, known)
+        tracks = join_matches(matches, tuple(features))
+        bundle = _grown(matches, tracks, features, known)
+        unsettled = list(wanted) if bundle is None else [name for name in wanted if name not in bundle.cameras]
+        if not unsettled:
+            break
     if bundle is None or unsettled:
         known_of = "; ".join(_known_of(name, matches, features, known) for name in unsettled[:3])
         raise D2Error(f"the images do not settle where camera {', '.join(unsettled)} stands ({known_of}): {ADD}")
@@ -135,11 +138,12 @@ def _known_of(name: str, matches: Matches, features: Mapping[str, Features], kno
         return f"{name} shares nothing with the others"
     said = f"{name} shares {len(matches[pair])} features with {pair[pair[0] == name]}"
     halves = [halved(matches, features, known, which)[pair] for which in (0, 1)]
-    found = [essential_pose(pair, half, features, known) for half in halves]
-    poses = [replace(known[name], T_camera_world=pose) for pose in found if pose is not None]
-    if len(poses) < 2:
+    one, other = (essential_pose(pair, half, features, known) for half in halves)
+    if one is None or other is None:
         return f"{said}, too few for two halves"
-    return f"{said}, two halves of which disagree by {degrees_between(*poses):.1f} degrees"
+    turn = degrees_between(*(replace(known[name], T_camera_world=pose) for pose in (one, other)))
+    way = 2 * np.rad2deg(np.arcsin(np.clip(np.linalg.norm(one[:3, 3] - other[:3, 3]) / 2, 0, 1)))  # of unit vectors
+    return f"{said}, two halves of which turn it {turn:.1f} degrees apart and place it {way:.1f} apart"
 
 
 def _of_one_size(name: str, taken: Sequence[np.ndarray]) -> Sequence[np.ndarray]:
@@ -149,8 +153,10 @@ def _of_one_size(name: str, taken: Sequence[np.ndarray]) -> Sequence[np.ndarray]
     return taken
 
 
-def _likely_focal(matches: Matches, features: Mapping[str, Features], known: Mapping[str, Camera]) -> dict[str, Camera]:
-    """The cameras with the focal length, one for all, with which the most matches agree on a motion."""
+def _likely_focals(
+    matches: Matches, features: Mapping[str, Features], known: Mapping[str, Camera]
+) -> list[dict[str, Camera]]:
+    """The cameras with each focal length, one for all, by which most matches agree on a motion, likeliest first."""
 
     def cameras(factor: float) -> dict[str, Camera]:
         lengths = {name: factor * max(camera.width, camera.height) for name, camera in known.items()}
@@ -162,7 +168,9 @@ def _likely_focal(matches: Matches, features: Mapping[str, Features], known: Map
     def agreeing(factor: float) -> int:
         return sum(len(pairs) for pairs in verified(matches, features, cameras(factor)).values())
 
-    return cameras(float(max(FOCALS, key=agreeing)))
+    agree = {factor: agreeing(factor) for factor in FOCALS.tolist()}
+    likely = [factor for factor in agree if agree[factor] > ALIKE * max(agree.values())]
+    return [cameras(factor) for factor in sorted(likely, key=lambda factor: (-agree[factor], abs(np.log(factor))))]
 
 
 def _grown(
