@@ -250,8 +250,7 @@ def _features(recording: Recording, cameras: Iterable[str]) -> dict[str, Feature
         factor = min(LONG_SIDE / max(image.shape[:2]), 1.0)
         small = cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA) if factor < 1 else image
         found = find_features([small])
-        pixels = found.pixels * np.array(image.shape[1::-1]) / small.shape[1::-1]
-        features[name] = replace(found, pixels=pixels)
+        features[name] = replace(found, pixels=found.pixels * image.shape[1::-1] / small.shape[1::-1])
     return features
 
 

@@ -53,8 +53,7 @@ def fundamental(one: Camera, other: Camera) -> np.ndarray:
     relative = other.T_camera_world @ np.linalg.inv(one.T_camera_world)
     x, y, z = relative[:3, 3]
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    product: np.ndarray = np.linalg.inv(other.K).T @ cross @ relative[:3, :3] @ np.linalg.inv(one.K)
-    return product
+    return np.asarray(np.linalg.inv(other.K).T @ cross @ relative[:3, :3] @ np.linalg.inv(one.K))
 
 
 def sampson(one: Camera, other: Camera, p: np.ndarray, q: np.ndarray) -> np.ndarray:
@@ -62,8 +61,7 @@ def sampson(one: Camera, other: Camera, p: np.ndarray, q: np.ndarray) -> np.ndar
     F, ones = fundamental(one, other), np.ones((len(p), 1))
     there, back = np.hstack([p, ones]) @ F.T, np.hstack([q, ones]) @ F
     squares = (there[:, :2] ** 2).sum(axis=1) + (back[:, :2] ** 2).sum(axis=1)
-    distance: np.ndarray = (np.hstack([q, ones]) * there).sum(axis=1) / np.sqrt(squares).clip(1e-300)
-    return distance
+    return np.asarray((np.hstack([q, ones]) * there).sum(axis=1) / np.sqrt(squares).clip(1e-300))
 
 
 Matched = Mapping[tuple[str, str], tuple[np.ndarray, np.ndarray]]  # two cameras -> pixels [m, 2] of the same things

@@ -56,8 +56,7 @@ class Undistortion:
         if not self._recorded.lens.bends:
             return recorded
         cv2 = opencv("undoing lens distortion")
-        undone: np.ndarray = cv2.remap(recorded, *self._maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
-        return undone
+        return np.asarray(cv2.remap(recorded, *self._maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT))
 
     @cached_property
     def _maps(self) -> tuple[Any, Any]:

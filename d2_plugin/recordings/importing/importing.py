@@ -300,8 +300,7 @@ def _write_images(folder: Path, recording: Recording, suffix: str, report: Repor
 
 def _exposures(folder: Path, recording: Recording, report: Report) -> dict[str, Exposure]:
     def make() -> dict[str, Any]:
-        measured = measured_exposures(recording, list(recording.cameras))
-        return {name: one._asdict() for name, one in measured.items()}
+        return {name: one._asdict() for name, one in measured_exposures(recording, list(recording.cameras)).items()}
 
     table = kept(folder, "exposures", make)
     exposures = {name: Exposure(tuple(one["gain"]), tuple(one["error"])) for name, one in table.items()}

@@ -79,8 +79,7 @@ class Curve(NamedTuple):
     def excess(self, which: int) -> np.ndarray:
         """Standard deviations [L] by which more agree than at all lags together."""
         chance = self.agree[which].sum() / max(self.could[which].sum(), 1e-9) * self.could[which]
-        excess: np.ndarray = (self.agree[which] - chance) / np.sqrt(chance + 1) / self.spread
-        return excess
+        return np.asarray((self.agree[which] - chance) / np.sqrt(chance + 1) / self.spread)
 
 
 class Seen(NamedTuple):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from d2_plugin.recordings.cameras.formats.cameras_json import camera_table, read
 from d2_plugin.recordings.cameras.undistort import UndistortedSource
 from d2_plugin.recordings.images import opencv
 from d2_plugin.recordings.importing.settings import ImportChoices, by_camera
-from d2_plugin.recordings.importing.video import VideoFile, VideoFrames
+from d2_plugin.recordings.importing.video import VideoFile, VideoFrames, decoded_alone
 from d2_plugin.recordings.recording import Camera, Recording, Source
 from d2_plugin.recordings.selection import spread
 
@@ -128,13 +128,22 @@ class VideosSource(Source):
 
     def checked(self, recording: Recording) -> Recording:
         """Smaller images of some moments of a recording out of here, decoded once for all that is checked on them."""
-        smaller = {
-            name: min(LONG_SIDE / max(camera.width, camera.height), 1) for name, camera in self.pinholes().items()
-        }
+        smaller = {name: min(LONG_SIDE / max(cut.size), 1) for name, cut in self.cuts.items()}
         cuts = {name: replace(cut, scale=cut.scale * smaller[name]) for name, cut in self.cuts.items()}
-        source, frames = replace(self, cuts=cuts), tuple(spread(recording.frames, MOMENTS))
+        source, frames = replace(self, cuts=cuts), self._moments(recording.frames)
         images = {name: {frame: source.image(name, frame) for frame in frames} for name in cuts}
         return replace(recording, cameras=source.pinholes(), frames=frames, source=KeptImages(images))
+
+    def _moments(self, frames: Sequence[int]) -> tuple[int, ...]:
+        """The first, the last, and near those that are spread between them the ones that take the least decoding."""
+        places, reach = spread(range(len(frames)), MOMENTS), len(frames) // (2 * MOMENTS)
+
+        def before(place: int) -> int:
+            own = ((self.videos[name], indices[frames[place]]) for name, indices in self.indices.items())
+            return sum(index - decoded_alone(video, index) for video, index in own)
+
+        places[1:-1] = [min((k, *range(k - reach, k + reach + 1)), key=before) for k in places[1:-1]]
+        return tuple(frames[place] for place in places)
 
     def recorded(self, camera: str) -> np.ndarray | None:
         whole = self._undistorted.recorded(camera)

@@ -31,8 +31,7 @@ class Tracks:
 
     def column(self, name: str) -> np.ndarray:
         """What one camera saw, [n]."""
-        column: np.ndarray = self.seen[:, self.names.index(name)]
-        return column
+        return np.asarray(self.seen[:, self.names.index(name)])
 
     def within(self, cameras: Mapping[str, Camera]) -> Tracks:
         """The rows that at least two of `cameras` saw, and only what these saw."""

@@ -157,7 +157,7 @@ def essential_pose(
     pair: Pair, pairs: np.ndarray, features: Mapping[str, Features], cameras: Mapping[str, Camera]
 ) -> np.ndarray | None:
     """T [4, 4] from the first camera to the second, which stands a unit away; None where the pairs say nothing."""
-    result = _ransac(pair, pairs, features, cameras)
+    result = _ransac(pair, pairs, features, cameras, MOST_TRIALS)
     if result is None:
         return None
     cv2 = opencv("finding cameras", "calibration")
@@ -170,11 +170,7 @@ def essential_pose(
 
 
 def _ransac(
-    pair: Pair,
-    pairs: np.ndarray,
-    features: Mapping[str, Features],
-    cameras: Mapping[str, Camera],
-    most: int = MOST_TRIALS,
+    pair: Pair, pairs: np.ndarray, features: Mapping[str, Features], cameras: Mapping[str, Camera], most: int
 ) -> dict[str, Any] | None:
     if len(pairs) < ENOUGH_MATCHES:
         return None

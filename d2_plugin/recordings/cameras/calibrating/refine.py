@@ -258,8 +258,7 @@ def halved(matches: Matches, features: Mapping[str, Features], given: Mapping[st
 def half_of(pixels: np.ndarray, camera: Camera) -> np.ndarray:
     """In which half of the cells of an image pixels [n, 2] lie, 0 or 1 [n]."""
     cells = np.floor(pixels / (camera.width, camera.height) * CELLS).astype(int)
-    half: np.ndarray = cells.sum(axis=1) % 2
-    return half
+    return np.asarray(cells.sum(axis=1) % 2)
 
 
 def _undetermined(given: Mapping[str, Camera], tracks: Sequence[Tracks]) -> str:
@@ -281,9 +280,8 @@ def _rms(cameras: Mapping[str, Camera], matches: Matches, features: Mapping[str,
 def _squares(cameras: Mapping[str, Camera], matches: Matches, features: Mapping[str, Features]) -> np.ndarray:
     """Squares [n] of Sampson's distance, where a match counts for no more than twice `pixel_error`."""
     squares = [np.zeros(0)]
-    for (a, b), pairs in matches.items():
-        p, q = features[a].pixels[pairs[:, 0]], features[b].pixels[pairs[:, 1]]
-        squares.append(np.minimum(np.abs(sampson(cameras[a], cameras[b], p, q)), 2 * pixel_error(cameras[a])) ** 2)
+    for (a, b), ends in _places(matches, features).items():
+        squares.append(np.minimum(np.abs(sampson(cameras[a], cameras[b], *ends)), 2 * pixel_error(cameras[a])) ** 2)
     return np.concatenate(squares)
 
 
@@ -308,14 +306,12 @@ def _judged(
     else:
         reason = f"the poses stay: two halves of the images differ about them by as much as they would change, {change}"
     accepted = falls and bool(larger.any())
-    cameras = laid if accepted else dict(given)
-    return RefinedPoses(cameras, accepted, reason, *pixels, changes, doubt, len(whole.points))
+    return RefinedPoses(laid if accepted else dict(given), accepted, reason, *pixels, changes, doubt, len(whole.points))
 
 
 def _mean_square(changes: Mapping[str, tuple[float, float]]) -> np.ndarray:
     """Of the degrees and of the shares, [2]."""
-    mean: np.ndarray = np.square(list(changes.values())).mean(axis=0)
-    return mean
+    return np.asarray(np.square(list(changes.values())).mean(axis=0))
 
 
 def _kept(given: Mapping[str, Camera], reason: str) -> RefinedPoses:
