@@ -269,13 +269,11 @@ def _place(pixels: np.ndarray, prior: DepthPrior, camera: CameraRecord, shape: t
         return None
     pose = camera.T_camera_world.numpy()
     ray = np.linalg.solve(camera.K.numpy(), [columns.mean() + 0.5, rows.mean() + 0.5, 1.0])
-    point: np.ndarray = (ray * np.median(depth[exact]) - pose[:3, 3]) @ pose[:3, :3]
-    return point
+    return np.asarray((ray * np.median(depth[exact]) - pose[:3, 3]) @ pose[:3, :3])
 
 
 def _pixel(point: np.ndarray, camera: CameraRecord) -> np.ndarray:
     """Where a world point [3] is seen, (column, row)."""
     pose = camera.T_camera_world.numpy()
     seen = camera.K.numpy() @ (pose[:3, :3] @ point + pose[:3, 3])
-    pixel: np.ndarray = seen[:2] / seen[2]
-    return pixel
+    return np.asarray(seen[:2] / seen[2])

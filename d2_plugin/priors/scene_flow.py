@@ -56,8 +56,7 @@ def foreground(image: np.ndarray, still: np.ndarray) -> np.ndarray:
     cv2 = opencv("scene flow")
     differs = (np.maximum.reduce(cv2.split(np.abs(image - still))) > FOREGROUND).astype(np.uint8)
     closed = cv2.morphologyEx(differs, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
-    opened: np.ndarray = cv2.morphologyEx(closed, cv2.MORPH_OPEN, np.ones((2, 2), np.uint8)) > 0
-    return opened
+    return np.asarray(cv2.morphologyEx(closed, cv2.MORPH_OPEN, np.ones((2, 2), np.uint8)) > 0)
 
 
 def dense_flow(image: np.ndarray, other: np.ndarray) -> np.ndarray:
@@ -65,8 +64,7 @@ def dense_flow(image: np.ndarray, other: np.ndarray) -> np.ndarray:
     cv2 = opencv("scene flow")
     method = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     method.setFinestScale(round(math.log2(max(image.shape[1] / FINE_WIDTH, 1))))
-    flow: np.ndarray = method.calc(*(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY) for rgb in (image, other)), None)
-    return flow
+    return np.asarray(method.calc(*(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY) for rgb in (image, other)), None))
 
 
 def followed(image: np.ndarray, other: np.ndarray, flow: np.ndarray, back: np.ndarray) -> np.ndarray:
@@ -190,8 +188,7 @@ def _search(
 def _window(values: np.ndarray, corner: np.ndarray, size: tuple[int, ...]) -> np.ndarray:
     """The part of an image that begins at (column, row) and has a size (columns, rows); 0 beyond the image."""
     cv2, moving = opencv("scene flow"), np.array([[1, 0, -corner[0]], [0, 1, -corner[1]]], np.float32)
-    window: np.ndarray = cv2.warpAffine(values, moving, size, flags=cv2.INTER_NEAREST)
-    return window
+    return np.asarray(cv2.warpAffine(values, moving, size, flags=cv2.INTER_NEAREST))
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,8 +233,7 @@ def common_acceleration(flights: Sequence[Flight]) -> np.ndarray | None:
     most = int(np.argmax(agree.sum(1)))
     if agree[most].sum() < max(FEWEST_AGREEING, 0.3 * len(seen)):
         return None
-    shared: np.ndarray = np.median(seen[agree[most]], axis=0)
-    return shared
+    return np.asarray(np.median(seen[agree[most]], axis=0))
 
 
 def same_region(a: np.ndarray, b: np.ndarray) -> bool:

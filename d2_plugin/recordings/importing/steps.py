@@ -59,8 +59,7 @@ def identity(settings: ImportSettings, paths: Mapping[str, Path]) -> dict[str, A
     given = {name: value for name, value in table.items() if isinstance(value, Path)}
     marks = {name: _fingerprint(path) for name, path in given.items()}
     videos = {name: _fingerprint(path) for name, path in paths.items()}
-    plain: dict[str, Any] = json.loads(json_text({**table, **marks, "videos": videos}, "import.json"))
-    return plain
+    return dict(json.loads(json_text({**table, **marks, "videos": videos}, "import.json")))
 
 
 def refuse_another(folder: Path, wanted: Mapping[str, Any]) -> None:
