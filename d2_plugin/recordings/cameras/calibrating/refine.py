@@ -108,11 +108,9 @@ def check_poses(recording: Recording) -> dict[str, Turn]:
     Raises:
         D2Error: fewer than two cameras, or pycolmap or OpenCV is not installed.
     """
-    features = {
-        name: of_a_still_camera([recording.image(name, frame) for frame in recording.frames])
-        for name in recording.cameras
-    }
-    return _turns(recording.cameras, *_expected(recording.cameras, features)[:2])[0]
+    given, frames = recording.cameras, recording.frames
+    features = {name: of_a_still_camera([recording.image(name, frame) for frame in frames]) for name in given}
+    return _turns(given, *_expected(given, features)[:2])[0]
 
 
 def turns_in_words(turns: Mapping[str, Turn], cameras: Collection[str]) -> list[str]:

@@ -137,7 +137,8 @@ def _known_of(name: str, matches: Matches, features: Mapping[str, Features], kno
     if pair is None:
         return f"{name} shares nothing with the others"
     said = f"{name} shares {len(matches[pair])} features with {pair[pair[0] == name]}"
-    one, other = (essential_pose(pair, halved(matches, features, known, k)[pair], features, known) for k in (0, 1))
+    halves = [halved(matches, features, known, which)[pair] for which in (0, 1)]
+    one, other = (essential_pose(pair, half, features, known) for half in halves)
     if one is None or other is None:
         return f"{said}, too few for two halves"
     turn = degrees_between(*(replace(known[name], T_camera_world=pose) for pose in (one, other)))
