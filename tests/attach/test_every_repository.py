@@ -44,18 +44,18 @@ def resuming(hooks: type, state: dict) -> type:
 class TestTraining:
     def test_all_hooks_off_is_bitwise_the_bare_loop(self, name: str, workplace: Path) -> None:
         (workplace / "d2.toml").write_text(D2Config().to_toml())
-        assert same(run(name, stop=19), run(name, attached(MIMICS[name], name), stop=19))
+        assert same(run(name, stop=15), run(name, attached(MIMICS[name], name), stop=15))
 
     @pytest.mark.usefixtures("workplace")
     def test_a_resumed_run_is_bitwise_the_uninterrupted_one(self, name: str) -> None:
         source = attached(MIMICS[name], name)
-        whole, first = run(name, source, stop=19), run(name, source, stop=11)
+        whole, first = run(name, source, stop=17), run(name, source, stop=11)
         assert {entry.hook for entry in whole.d2.trace} == {"densify", "prune", "depth_loss"}
         assert all(value.isfinite().all() for value in snapshot(whole).values())
         checkpoint, state = (saved(name, first), 11), copy.deepcopy(first.d2.state_dict())
-        forgetful = run(name, source, checkpoint=copy.deepcopy(checkpoint), stop=19)
+        forgetful = run(name, source, checkpoint=copy.deepcopy(checkpoint), stop=17)
         source.D2Hooks = resuming(source.D2Hooks, state)
-        assert same(whole, run(name, source, checkpoint=checkpoint, stop=19))
+        assert same(whole, run(name, source, checkpoint=checkpoint, stop=17))
         assert not same(whole, forgetful), "D2's state does not matter: this could not fail"
 
 
