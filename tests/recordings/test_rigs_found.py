@@ -65,6 +65,8 @@ class TestFocalLengths:
         truth = arc(3, 4.0)  # hardly any angle: focal length and depth change places
         with pytest.raises(D2Error, match=r"two halves of the images disagree about|do not settle"):
             solve_features(seen_by(truth, things=60), blind(truth), tuple(truth), focal="each")
+        with pytest.raises(D2Error, match="c0 shares nothing with the others"):
+            solve_features(seen_by(truth, things=6, wrong=1.0), blind(truth), tuple(truth), focal="shared")
 
 
 class TestBoards:

@@ -49,7 +49,7 @@ LARGEST_FOCAL_DOUBT = 0.03  # share that they may differ by about a focal length
 
 FOCALS = np.geomspace(0.45, 2.4, 9)
 """Focal lengths that are tried where none is known, in longer sides of the image: 96 to 24 degrees across."""
-ALIKE = 0.98  # share of the most matches that agree with one of them, above which another one is tried as well
+ALIKE = 0.98  # share of the most matches that agree with one of them, from which on another one is tried as well
 
 STARTS = 2  # pairs of cameras that are tried as a start, the most promising first
 FEWEST_SEEN = 12  # points that settle a camera, at least, and as a share of those it should see
@@ -169,7 +169,7 @@ def _likely_focals(
         return sum(len(pairs) for pairs in verified(matches, features, cameras(factor)).values())
 
     agree = {factor: agreeing(factor) for factor in FOCALS.tolist()}
-    likely = [factor for factor in agree if agree[factor] > ALIKE * max(agree.values())]
+    likely = [factor for factor in agree if agree[factor] >= ALIKE * max(agree.values())]
     return [cameras(factor) for factor in sorted(likely, key=lambda factor: (-agree[factor], abs(np.log(factor))))]
 
 
