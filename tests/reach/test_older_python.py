@@ -1,9 +1,9 @@
-"""What a trainer's process imports runs where official environments stand: Python 3.9 and torch 2.0."""
+"""What a trainer's process imports is little, and runs where official environments stand: Python 3.9 and torch 2.0."""
 
 from __future__ import annotations
 
 import ast
-import functools
+import os
 import subprocess
 import sys
 from collections.abc import Callable
@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Annotated, Optional
 
 import pytest
+from mimics.workplace import furnish
 
 from d2_plugin import older, registry
 from d2_plugin.config import D2Config
@@ -19,10 +20,51 @@ from d2_plugin.errors import D2Error
 from d2_plugin.hooks import HOOKS
 from d2_plugin.settings import Range, Settings, declared
 
+MOST = 45
+"""Modules of this project in an attached process, its adapter among them; four of them are the store's."""
+
+OUTSIDE = ("d2_plugin.priors", "d2_plugin.recordings", "d2_plugin.runs", "d2_plugin.viewing", "d2_plugin.commands")
+"""Rooms that no trainer needs."""
+
+NOT_NEEDED = ("cv2", "pycolmap", "onnxruntime", "rich", "matplotlib")
+"""Packages that training does without; a bare import needs neither these nor torch and numpy."""
+
+BARE = "import sys, d2_plugin; print(*sys.modules)"
+
+ATTACHED = f"""
+import sys
+for name in {NOT_NEEDED}:
+    sys.modules[name] = None  # an import of it now fails
+import no_dynamo, torch
+from d2_plugin import D2Hooks
+from d2_plugin.protocol import View
+from d2_plugin.adapters.gsplat_dict import GsplatAdapter
+
+parameters = {{"means": (8, 3), "scales": (8, 3), "quats": (8, 4), "opacities": (8,)}}
+parameters |= {{"sh0": (8, 1, 3), "shN": (8, 0, 3)}}
+torch.manual_seed(0)
+splats = torch.nn.ParameterDict({{name: torch.nn.Parameter(torch.rand(shape)) for name, shape in parameters.items()}})
+with torch.no_grad():
+    splats["means"][:, 2] += 2.5
+optimizers = {{name: torch.optim.Adam([value], lr=1e-3) for name, value in splats.items()}}
+d2 = D2Hooks.from_config("d2.toml", backbone=GsplatAdapter(splats, optimizers, {{}}))
+K = torch.tensor([[30.0, 0, 16], [0, 30, 12], [0, 0, 1]])
+pose = torch.eye(4)
+pose[0, 3] = 0.4
+for step in range(1, 11):
+    d2.loss(step, View("cam0", 0, 0.0, pose, K, 32, 24)).backward()
+    for optimizer in optimizers.values():
+        optimizer.step()
+        optimizer.zero_grad()
+    d2.step(step)
+assert {{"densify", "prune", "depth_loss"}} <= set(d2.hooks) and d2.trace
+print(*(name for name in sys.modules if name.partition(".")[0] == "d2_plugin"))
+"""
+"""Ten attached steps; prints what they loaded."""
+
 LOADED = """
-import importlib, pkgutil, sys
-import d2_plugin
-from d2_plugin import D2Config, D2Hooks, registry
+import importlib, pkgutil
+from d2_plugin import registry
 import d2_plugin.attach.launch, d2_plugin.store.exported
 for room in ("hooks", "gaussians", "rasterizer", "adapters", "compat", "attach"):
     package = importlib.import_module("d2_plugin." + room)
@@ -31,22 +73,45 @@ for room in ("hooks", "gaussians", "rasterizer", "adapters", "compat", "attach")
             importlib.import_module(found.name)
 for name in registry.names(registry.ADAPTERS):
     registry.load(registry.ADAPTERS, name)
-for name, module in sorted(sys.modules.items()):
-    if name.split(".")[0] == "d2_plugin" and getattr(module, "__file__", None):
-        print(module.__file__)
+print(*(
+    module.__file__ for name, module in sorted(sys.modules.items())
+    if name.split(".")[0] == "d2_plugin" and getattr(module, "__file__", None)
+))
 """
-"""Imports what a trainer may, and prints the files that this loads."""
+"""Imports, in the same process, all that a trainer may, and prints the files that this loads."""
 
 
-@functools.cache
-def trainer_files() -> list[str]:
-    done = subprocess.run([sys.executable, "-c", LOADED], capture_output=True, text=True, check=True)
-    return done.stdout.split()
+def printed(script: str) -> list[list[str]]:
+    """The words of each line that a script prints in a process of its own."""
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
+    done = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return [line.split() for line in done.stdout.splitlines()]
 
 
-def test_what_a_trainer_imports_keeps_to_python_3_9() -> None:
+@pytest.fixture(scope="module")
+def trainer(tmp_path_factory: pytest.TempPathFactory) -> list[list[str]]:
+    """Modules that attached steps loaded, and the files of all that a trainer may import."""
+    with pytest.MonkeyPatch.context() as patch:
+        furnish(tmp_path_factory.mktemp("workplace"), patch)
+        return printed(ATTACHED + LOADED)[-2:]
+
+
+def test_importing_the_plugin_imports_nothing_else() -> None:
+    [names] = printed(BARE)
+    assert [name for name in names if name.startswith("d2_plugin")] == ["d2_plugin"]
+    assert not {"torch", "numpy", *NOT_NEEDED} & set(names)
+
+
+def test_an_attached_step_needs_torch_and_numpy_and_imports_the_core_and_the_store_alone(trainer: list) -> None:
+    names = trainer[0]
+    assert not [name for name in names if name.startswith(OUTSIDE)]
+    assert len(names) <= MOST, "\n".join(names)
+
+
+def test_what_a_trainer_imports_keeps_to_python_3_9(trainer: list) -> None:
     pytest.importorskip("vermin", reason="needs vermin")
-    files = trainer_files()
+    files = trainer[1]
     names = {Path(file).relative_to(Path(files[0]).parent).as_posix() for file in files if "d2_plugin" in file}
     assert {"plugin.py", "protocol.py", "settings.py", "store/store.py", "attach/launch.py"} <= names
     options = ["--no-tips", "--violations", "--no-parse-comments", "--exclude", "long"]  # Tensor.long is no Python 2
@@ -65,8 +130,8 @@ def unions_at_run_time(text: str) -> list[str]:
     return [union for union in found if "{" not in union and types & set(union.split(" | "))]
 
 
-def test_no_union_of_types_is_evaluated_at_run_time() -> None:
-    found = {file: unions_at_run_time(Path(file).read_text()) for file in trainer_files()}
+def test_no_union_of_types_is_evaluated_at_run_time(trainer: list) -> None:
+    found = {file: unions_at_run_time(Path(file).read_text()) for file in trainer[1]}
     assert {file: unions for file, unions in found.items() if unions} == {}
     assert unions_at_run_time("x = f(float | None)\ndef g(a: int | None) -> str | None: ...") == ["float | None"]
 
