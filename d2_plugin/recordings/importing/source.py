@@ -135,7 +135,7 @@ class VideosSource(Source):
         return replace(recording, cameras=source.pinholes(), frames=frames, source=KeptImages(images))
 
     def _moments(self, frames: Sequence[int]) -> tuple[int, ...]:
-        """The first, the last, and near those that are spread between them the ones that take the least decoding."""
+        """The first, the last, and evenly spread ones between, each moved a little to where least must be decoded."""
         places, reach = spread(range(len(frames)), MOMENTS), len(frames) // (2 * MOMENTS)
 
         def before(place: int) -> int:

@@ -32,7 +32,7 @@ PIXEL_ERROR = 1.5  # largest distance of a match from its epipolar line, in pixe
 LONG_SIDE = 960.0
 
 LEAST_INLIERS = 0.05  # share of inliers that RANSAC looks for, at least
-MOST_TRIALS, FEW_TRIALS = 100_000, 20_000  # of RANSAC; few where matches were asked of known poses before
+MOST_TRIALS, FEW_TRIALS = 100_000, 20_000  # of RANSAC; few where known poses have dropped matches before
 
 Pair = tuple[str, str]
 Matches = dict[Pair, np.ndarray]  # two cameras -> indices [m, 2] into their lists of features
@@ -117,7 +117,7 @@ def _match(one: Features, other: Features) -> np.ndarray:
         best = np.arange(len(rows)), products.argmax(axis=1)
         first, mutual = products[best], products[best] == products.max(axis=0)[best[1]]
         products[best] = -1
-        near, second = (np.sqrt(np.maximum(2 - 2 * of, 0)) for of in (first, products.max(axis=1)))
+        near, second = (np.sqrt(np.maximum(2 - 2 * product, 0)) for product in (first, products.max(axis=1)))
         good = mutual & (near < RATIO * second)
         matches.append(np.stack([rows[good], columns[best[1][good]]], axis=1))
     return _distinct(np.concatenate(matches), one, other)

@@ -49,7 +49,7 @@ LARGEST_FOCAL_DOUBT = 0.03  # share that they may differ by about a focal length
 
 FOCALS = np.geomspace(0.45, 2.4, 9)
 """Focal lengths that are tried where none is known, in longer sides of the image: 96 to 24 degrees across."""
-ALIKE = 0.98  # share of the most matches that agree with one of them, from which on another one is tried as well
+ALIKE = 0.98  # a length that explains this share of the most matches that any explains is tried as well
 
 STARTS = 2  # pairs of cameras that are tried as a start, the most promising first
 FEWEST_SEEN = 12  # points that settle a camera, at least, and as a share of those it should see
