@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from d2_plugin.priors.evidence import AT_BEST, with_evidence
-from d2_plugin.priors.fuse import fuse, hanging_pixels
+from d2_plugin.priors.fuse import fuse, hanging_pixels, with_matches
 from d2_plugin.priors.maps_on_disk import divided, planar
 from d2_plugin.priors.monocular.across import Shown, aligned_across
 from d2_plugin.priors.monocular.align import (
@@ -35,7 +35,7 @@ from d2_plugin.protocol import Label
 from d2_plugin.recordings.recording import Camera, MonoKind
 from d2_plugin.store.maps import FusedPrior, empty_prior
 
-CONSTRUCTION_VERSION = 15  # raise it when alignment or fusion change what they return
+CONSTRUCTION_VERSION = 16  # raise it when alignment or fusion change what they return
 
 FARTHEST = 3.0
 """Aligned monocular depth beyond this multiple of the 99.5 percentile of the anchors is left empty."""
@@ -229,7 +229,10 @@ def _view_prior(prepared: _Prepared, several: _Prepared | None, settings: PriorS
     view = prepared.view
     mono = _aligned(prepared, settings)
     multi = None if several is None else _aligned(several, settings)
-    maps = _fused(mono if multi is None else _voted(mono, multi, prepared, settings), prepared, settings)
+    both = mono if multi is None else _voted(mono, multi, prepared, settings)
+    maps = _fused(both, prepared, settings)
+    if settings.agreement > 0 and settings.variant == "dual" and view.geometric and both.uncertainty:
+        maps = with_matches(maps, both.depth, both.uncertainty.sigma, view.geometric.unconfirmed)
     if settings.far and settings.variant == "dual" and not mono.refused:
         maps = _with_far(maps, mono, prepared)
     if view.recorded is not None:

@@ -173,7 +173,7 @@ def filter_sensor(depth: np.ndarray, settings: StereoSettings) -> GeometricDepth
         "kept": int(np.count_nonzero(final)),
     }
     sigma = np.where(final > 0, np.float32(settings.sensor_sigma), np.float32(np.inf))
-    return GeometricDepth(final, sigma, {"survivors": survivors})
+    return GeometricDepth(final, sigma, np.zeros_like(final), {"survivors": survivors})
 
 
 def flying_pixels(depth: np.ndarray) -> np.ndarray:

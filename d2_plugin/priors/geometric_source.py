@@ -21,10 +21,11 @@ from d2_plugin.recordings.recording import Camera
 from d2_plugin.store.files import Entry, EntryFolder, hash_of
 from d2_plugin.store.maps import SIGMA, DepthRange, encode_sigma
 
-VERSION = 9  # raise it when a matcher or the filter changes what it returns, so that caches are not trusted
+VERSION = 10  # raise it when a matcher or the filter changes what it returns, so that caches are not trusted
 
 STEREO_DTYPE = np.dtype([("depth", "<u2"), ("sigma", "u1")])
-"""Geometric depth as it is stored, pixel by pixel: logarithms, in 16 and in 8 bits."""
+"""Geometric depth as it is stored, pixel by pixel: logarithms, in 16 and in 8 bits. Matches that nobody confirms stand
+between, with an infinite sigma."""
 
 
 class GeometricSource(ABC):
@@ -86,10 +87,11 @@ class GeometricSource(ABC):
 
     def _write(self, camera: str, frame: int, depth: GeometricDepth, key: str) -> GeometricDepth:
         """Store one map, and return it as it will be read back."""
-        depth_range = DepthRange.of(depth.depth)
+        matched = np.where(depth.depth > 0, depth.depth, depth.unconfirmed)
+        depth_range = DepthRange.of(matched)
         about = {"key": key, "matcher": self.matcher, "depth_range": [depth_range.near, depth_range.far]}
         codes = np.empty(depth.depth.shape, STEREO_DTYPE)
-        codes["depth"], codes["sigma"] = depth_range.encode(depth.depth), encode_sigma(depth.sigma)
+        codes["depth"], codes["sigma"] = depth_range.encode(matched), encode_sigma(depth.sigma)
         return _decoded(codes, self.entries.write(camera, frame, codes, about | depth.record))
 
 
@@ -99,5 +101,6 @@ def stored_depth(entry: Entry) -> GeometricDepth:
 
 
 def _decoded(codes: np.ndarray, record: dict[str, Any]) -> GeometricDepth:
-    depth = DepthRange(*record["depth_range"]).decode(codes["depth"])
-    return GeometricDepth(depth, SIGMA[codes["sigma"]], record)
+    matched, sigma = DepthRange(*record["depth_range"]).decode(codes["depth"]), SIGMA[codes["sigma"]]
+    confirmed = sigma < np.inf
+    return GeometricDepth(matched * confirmed, sigma, matched * ~confirmed, record)

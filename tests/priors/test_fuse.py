@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -9,7 +11,14 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from d2_plugin.errors import D2Error
-from d2_plugin.priors.fuse import VARIANTS, cross_source_discrepancy, fuse, hanging_pixels, verified_region
+from d2_plugin.priors.fuse import (
+    VARIANTS,
+    cross_source_discrepancy,
+    fuse,
+    hanging_pixels,
+    verified_region,
+    with_matches,
+)
 from d2_plugin.priors.monocular.align import Alignment, AlignStatus, aligned_inverse
 from d2_plugin.priors.monocular.far import far_pixels
 from d2_plugin.protocol import Label
@@ -117,6 +126,29 @@ def test_the_blur_of_a_depth_edge_proposes_nothing_but_still_verifies() -> None:
     assert not hanging_pixels(mono, 0).any()
     mono[:, 30:40] = 0  # a hole is no edge
     assert not hanging_pixels(mono, 0.08)[:, 20:50].any()
+
+
+def test_a_match_that_no_view_confirms_counts_where_the_map_does_as_far_as_the_map_knows() -> None:
+    # Near, 5 sigma off, no match, no map, a map that knows nothing, 25 % off, stereo, near where the map hangs.
+    mono = np.float32([[2.0, 2.0, 2.0, 0.0, 2.0, 2.0, 2.0, 2.0]])
+    sigma = np.float32([[0.04, 0.04, 0.04, np.inf, np.inf, 0.50, 0.04, 0.04]])
+    unconfirmed = np.float32([[2.1, 2.5, 0.0, 2.1, 2.0, 2.5, 0.0, 1.9]])
+    geometric = np.float32([[0, 0, 0, 0, 0, 0, 2.02, 0]])
+    hanging = np.arange(8)[None] == 7
+    uncertain = {"sigma_mono": sigma, "sigma_geometric": np.where(geometric > 0, np.float32(0.001), np.float32(np.inf))}
+    fused = fuse(mono, geometric, tau_c=0.1, hanging=hanging, **uncertain)
+    found = with_matches(fused, mono, sigma, unconfirmed)
+    taken = np.flatnonzero((found.depth != fused.depth)[0])
+    assert taken.tolist() == [0, 7]
+    np.testing.assert_array_equal(found.depth[0, taken], unconfirmed[0, taken])
+    assert found.labels[0, [0, 1, 6, 7]].tolist() == [Label.VERIFIED, Label.MONO, Label.VERIFIED, Label.VERIFIED]
+    assert (found.sigma[0, taken] > uncertain["sigma_geometric"][0, 6]).all()
+    assert (found.sigma[0, taken] < sigma[0, taken]).all()
+    for unit in (1e-30, 1e30):
+        there = replace(fused, depth=fused.depth * np.float32(unit))
+        scaled = with_matches(there, mono * np.float32(unit), sigma, unconfirmed * np.float32(unit))
+        np.testing.assert_array_equal(scaled.labels, found.labels)
+        np.testing.assert_allclose(scaled.sigma, found.sigma, rtol=1e-5)
 
 
 def test_unknown_variants_and_unequal_sizes_are_refused() -> None:

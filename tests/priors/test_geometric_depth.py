@@ -89,7 +89,7 @@ def test_half_the_size_fills_what_the_full_size_leaves_empty(
 def geometric(depth: np.ndarray) -> GeometricDepth:
     """One view's depth with a sigma of one per cent."""
     sigma = np.where(depth > 0, 0.01, np.inf).astype(np.float32)
-    return GeometricDepth(depth, sigma, {})
+    return GeometricDepth(depth, sigma, np.zeros_like(depth), {})
 
 
 def test_enlarging_a_plane_is_exact_and_an_edge_is_left_out() -> None:

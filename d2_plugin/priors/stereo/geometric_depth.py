@@ -84,12 +84,13 @@ def _matched(
 
 def _filled(results: Sequence[GeometricDepth]) -> GeometricDepth:
     """The first of several results of one view, with what the later ones know where it is empty."""
-    depth, sigma = results[0].depth.copy(), results[0].sigma.copy()
+    depth, sigma, unconfirmed = (map_.copy() for map_ in (results[0].depth, results[0].sigma, results[0].unconfirmed))
     for coarser in results[1:]:
         empty = depth == 0
         depth[empty], sigma[empty] = coarser.depth[empty], coarser.sigma[empty]
+        unconfirmed = np.where(unconfirmed > 0, unconfirmed, coarser.unconfirmed)
     survivors = results[0].record["survivors"] | {"filled": int(np.count_nonzero(depth))}
-    return GeometricDepth(depth, sigma, {"survivors": survivors})
+    return GeometricDepth(depth, sigma, unconfirmed * (depth == 0), {"survivors": survivors})
 
 
 def gray(image: np.ndarray) -> np.ndarray:
@@ -119,20 +120,22 @@ def enlarged(result: GeometricDepth, width: int, height: int, tolerance: float =
         return result
     rows, row_share = _neighbours(result.depth.shape[0], height)
     columns, column_share = _neighbours(result.depth.shape[1], width)
-    corners = [result.depth[r][:, c] for r in rows for c in columns]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        inverse = [1 / corner for corner in corners]
-        top = inverse[0] * (1 - column_share) + inverse[1] * column_share
-        bottom = inverse[2] * (1 - column_share) + inverse[3] * column_share
-        depth = 1 / (top * (1 - row_share)[:, None] + bottom * row_share[:, None])
-    nearest, farthest = np.minimum.reduce(corners), np.maximum.reduce(corners)
-    smooth = (nearest > 0) & (farthest - nearest <= 2 * tolerance * nearest)
+
+    def interpolated(depth: np.ndarray) -> np.ndarray:
+        corners = [depth[r][:, c] for r in rows for c in columns]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            inverse = [1 / corner for corner in corners]
+            top = inverse[0] * (1 - column_share) + inverse[1] * column_share
+            bottom = inverse[2] * (1 - column_share) + inverse[3] * column_share
+            between = 1 / (top * (1 - row_share)[:, None] + bottom * row_share[:, None])
+        nearest, farthest = np.minimum.reduce(corners), np.maximum.reduce(corners)
+        smooth = (nearest > 0) & (farthest - nearest <= 2 * tolerance * nearest)
+        return np.where(smooth, between, 0).astype(np.float32)
+
     row, column = np.where(row_share < 0.5, rows[0], rows[1]), np.where(column_share < 0.5, columns[0], columns[1])
-    return replace(
-        result,
-        depth=np.where(smooth, depth, 0).astype(np.float32),
-        sigma=np.where(smooth, result.sigma[row][:, column], np.float32(np.inf)),
-    )
+    depth = interpolated(result.depth)
+    sigma = np.where(depth > 0, result.sigma[row][:, column], np.float32(np.inf))
+    return replace(result, depth=depth, sigma=sigma, unconfirmed=interpolated(result.unconfirmed))
 
 
 def _neighbours(small: int, large: int) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:

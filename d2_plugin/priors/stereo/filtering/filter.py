@@ -29,6 +29,8 @@ TEXTURE_MIN = 0.005
 any texture are refused, because coherence tells wrong matches better; OpenMVS, without it, asks for .02."""
 COHERENCE_MIN = 0.57
 """A depth survives when this share of its neighbours lies on its tangent plane."""
+PLAUSIBLE = 0.5
+"""From this share on a match that other views do not confirm may still be confirmed by a network's map."""
 REACH = 9
 """Half the side of the square window of coherence, pixels, a multiple of `STRIDE`."""
 CONTRAST = 0.05
@@ -47,12 +49,14 @@ class GeometricDepth:
     """D^g of one view after filtering.
 
     `depth` [H, W] float32 is planar z, 0 where nothing survived (the complement of Omega^g); `sigma` [H, W] float32 is
-    its relative standard deviation, infinite where there is none; `record` is what is stored beside them, as plain
+    its relative standard deviation, infinite where there is none; `unconfirmed` [H, W] float32 are matches elsewhere
+    that lack the word of another view alone, 0 where there is none; `record` is what is stored beside them, as plain
     values: under `survivors` how many pixels were left after each test, in order.
     """
 
     depth: np.ndarray
     sigma: np.ndarray
+    unconfirmed: np.ndarray
     record: dict[str, Any]
 
 
@@ -98,7 +102,8 @@ def filter_depths(
         }
         evidence = (coherent[index], confirmation.parallax, confirmation.spread, grey_gradient(gray))
         sigma = geometric_sigma(final, *evidence)
-        results.append(GeometricDepth(final, sigma, {"survivors": survivors}))
+        unconfirmed = textured[index] * ((coherent[index] >= PLAUSIBLE) & (final == 0))
+        results.append(GeometricDepth(final, sigma, unconfirmed, {"survivors": survivors}))
     return results
 
 
