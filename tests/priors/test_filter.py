@@ -48,6 +48,10 @@ def test_true_depth_survives_where_another_view_sees_it(recording: Recording) ->
     for result, depth in zip(results, depths):
         assert (result.depth > 0).mean() > 0.5
         np.testing.assert_array_equal(result.depth[(result.depth > 0)], depth[(result.depth > 0)])
+        alone = result.unconfirmed > 0  # what one view sees, and it alone
+        assert alone.sum() > 0.25 * (result.depth == 0).sum()
+        np.testing.assert_array_equal(result.unconfirmed[alone], depth[alone])
+        assert not (result.depth[alone] > 0).any()
         survivors = result.record["survivors"]
         assert list(survivors.values()) == sorted(survivors.values(), reverse=True)
         assert survivors["kept"] == np.count_nonzero(result.depth)
@@ -69,6 +73,7 @@ def test_random_depth_leaves_nearly_nothing(recording: Recording) -> None:
     noise = [rng.uniform(2, 8, depth.shape).astype(np.float32) for depth in depths]
     for result in filter_depths(grays, cameras, noise, costs, SETTINGS):
         assert (result.depth > 0).mean() < 0.001
+        assert (result.unconfirmed > 0).mean() < 0.001
 
 
 def test_bad_matches_are_dropped(recording: Recording) -> None:
@@ -76,6 +81,7 @@ def test_bad_matches_are_dropped(recording: Recording) -> None:
     costs[0] = np.full_like(costs[0], COST_MAX + 0.01)
     results = filter_depths(grays, cameras, depths, costs, SETTINGS)
     assert not results[0].depth.any()
+    assert not results[0].unconfirmed.any()
     # A depth that did not match is not there, so it cannot confirm another view either.
     strict = filter_depths(grays, cameras, depths, costs, replace(SETTINGS, min_sources=2))
     assert not strict[1].depth.any()
