@@ -27,17 +27,7 @@ from d2_plugin.rasterizer import rasterize
 from .cameras import inria_view
 from .keys import KeyOf, PriorKey, key_from_image_name
 from .probe import Probe, probe_package
-from .shared import (
-    Renders,
-    Resizing,
-    appended,
-    finite,
-    identities,
-    on_device,
-    optional,
-    seen_colors,
-    steps_of_adam,
-)
+from .shared import Renders, Resizing, appended, finite, identities, on_device, optional, seen_colors, steps_of_adam
 
 log = logging.getLogger(__name__)
 

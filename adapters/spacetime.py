@@ -43,14 +43,7 @@ class SpacetimeAdapter(InriaAdapter):
     evidence = InriaAdapter.evidence | {"omegamask": 1.0}
     """From iteration 8001 on gradients of `_omega` are multiplied by `omegamask`, which insertion does not extend."""
 
-    def __init__(
-        self,
-        gaussians: Any,
-        duration: int,
-        *,
-        first_frame: int = 0,
-        key: KeyOf | None = None,
-    ) -> None:
+    def __init__(self, gaussians: Any, duration: int, *, first_frame: int = 0, key: KeyOf | None = None) -> None:
         super().__init__(gaussians, key)
         self.duration, self.first_frame = duration, first_frame
         self._fading: Tensor | None = None

@@ -22,16 +22,7 @@ from d2_plugin.gaussians.spherical_harmonics import coefficients_from_rgb
 from d2_plugin.protocol import Points, RasterSettings, Splats, View
 
 from ..keys import KeyOf, PriorKey, key_from_image_name
-from ..shared import (
-    Resizing,
-    appended,
-    finite,
-    identities,
-    on_device,
-    optional,
-    seen_colors,
-    with_rows,
-)
+from ..shared import Resizing, appended, finite, identities, on_device, optional, seen_colors, with_rows
 
 CONSTANTS = RasterSettings(alpha_max=1 - 1e-6)
 """Of its rasterizer (rasterization_config.h): alpha is not clamped; near comes from the camera."""

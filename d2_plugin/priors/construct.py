@@ -16,14 +16,7 @@ from d2_plugin.priors.evidence import AT_BEST, with_evidence
 from d2_plugin.priors.fuse import fuse, hanging_pixels, with_matches
 from d2_plugin.priors.maps_on_disk import divided, planar
 from d2_plugin.priors.monocular.across import Shown, aligned_across
-from d2_plugin.priors.monocular.align import (
-    Alignment,
-    AlignStatus,
-    align,
-    aligned_depth,
-    aligned_inverse,
-    not_aligned,
-)
+from d2_plugin.priors.monocular.align import Alignment, AlignStatus, align, aligned_depth, aligned_inverse, not_aligned
 from d2_plugin.priors.monocular.correct import corrected_depth
 from d2_plugin.priors.monocular.far import far_pixels
 from d2_plugin.priors.monocular.uncertainty import Skill, Uncertainty, monocular_uncertainty

@@ -80,11 +80,7 @@ class SparsePoints:
         return cls(*(np.concatenate([getattr(part, field.name) for part in together]) for field in fields(cls)))
 
 
-def triangulate(
-    images: Sequence[np.ndarray],
-    cameras: Sequence[Camera],
-    frame: int = 0,
-) -> SparsePoints:
+def triangulate(images: Sequence[np.ndarray], cameras: Sequence[Camera], frame: int = 0) -> SparsePoints:
     """Surface points seen by at least two of `cameras` at one instant.
 
     Args:
@@ -114,11 +110,7 @@ def triangulate(
         return _collected(model, images, frame)
 
 
-def triangulate_frames(
-    recording: Recording,
-    cameras: Sequence[str],
-    frames: Iterable[int],
-) -> SparsePoints:
+def triangulate_frames(recording: Recording, cameras: Sequence[str], frames: Iterable[int]) -> SparsePoints:
     """`triangulate` for each of `frames` of a recording, joined; images are read one instant at a time."""
     calibrations = [recording.cameras[name] for name in cameras]
     parts = []
