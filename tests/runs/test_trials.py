@@ -75,7 +75,7 @@ def test_ssim_at_left_out_cameras_decides_and_one_line_says_so() -> None:
     helps, harms = Trials({"a": GOOD}, {"a": BAD}, 1.0), Trials({"a": BAD}, {"a": GOOD}, 1.0)
     assert (helps.choice, harms.choice) == ("all", "stereo")
     assert Trials({"a": Score(0.797, 24.0)}, {"a": GOOD}, 1.0).choice == "all"  # it knows more, and is as good
-    assert "stereo alone is used (left-out cameras: SSIM 0.700 with it, 0.800 without)" in str(harms)
+    assert "confirms stereo, which alone is used (left-out cameras: SSIM 0.700 with it, 0.800 without)" in str(harms)
     assert "the whole prior is used" in str(helps)
     assert harms.as_dict()["scores"]["all"] == {"a": {"ssim": 0.7, "psnr": 25.0}}
 
@@ -121,7 +121,7 @@ def test_depth_that_is_right_is_believed_and_depth_that_is_not_is_not_whatever_i
 
 @pytest.fixture
 def tried(monkeypatch: pytest.MonkeyPatch) -> list[RunSettings]:
-    """Trials that take no time and find the network of no use; the settings that they were made with."""
+    """Trials that take no time and find that the network confirms stereo; the settings that they were made with."""
     made: list[RunSettings] = []
 
     def told(settings: RunSettings, *_: object) -> Trials:
@@ -212,7 +212,7 @@ def test_what_one_run_tried_serves_every_trainer_with_that_prior_until_the_prior
     assert [(one.seed, one.backbone) for one in tried] == [(0, "yang4d")]
     store = PriorStore.open(tmp_path / "priors")
     assert PriorLoader(store).believe == "stereo"
-    assert "of no use" in PriorLoader(store).verdict
+    assert "confirms stereo" in PriorLoader(store).verdict
     assert PriorLoader(store, believe="all").believe == "all", "the user's own word stands"
     maps = (np.zeros((HEIGHT, WIDTH), kind) for kind in (np.float32, np.uint8, np.float32))
     empty = FusedPrior(*maps, np.zeros((HEIGHT, WIDTH, 3), np.uint8))

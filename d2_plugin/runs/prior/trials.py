@@ -81,7 +81,7 @@ class Trials:
 
     def __str__(self) -> str:
         believed = self.choice == "all"
-        verdict = "is worth inserting: the whole prior is used" if believed else "is of no use: stereo alone is used"
+        verdict = "is worth inserting: the whole prior is used" if believed else "confirms stereo, which alone is used"
         with_it, without = _mean_ssim(self.everything), _mean_ssim(self.stereo)
         return f"here monocular depth {verdict} (left-out cameras: SSIM {with_it:.3f} with it, {without:.3f} without)"
 
