@@ -112,9 +112,9 @@ def fuse(
 def with_matches(maps: FusedPrior, mono: np.ndarray, sigma: np.ndarray, unconfirmed: np.ndarray) -> FusedPrior:
     """D* with the matches that the monocular map confirms where no other view does; an addition to the paper.
 
-    A match [H, W] near the map, 0 where there is none, is verified, as the paper has it, and takes the place of the
-    map's depth, which is not as exact, or of nothing, at an edge that the map blurs. Its sigma says that it had one
-    witness: a share of the map's `sigma` and of how far the two are apart.
+    A match (all maps are float [H, W], depths 0 where there is none) near `mono` is verified, as the paper has it, and
+    takes the place of the map's depth, which is not as exact, or of nothing, at an edge that the map blurs. Its sigma
+    says that it had one witness: a share of the relative `sigma` of the map and of how far the two are apart.
     """
     known = (mono > 0) & (unconfirmed > 0) & (sigma < np.inf)
     apart = np.abs(np.log(np.where(known, unconfirmed, 1) / np.where(known, mono, 1)))
