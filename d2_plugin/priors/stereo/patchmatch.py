@@ -2,21 +2,23 @@
 
 Each pixel carries a plane, linear in inverse depth over the image, and keeps the best of what it draws at random and
 of what its neighbours found (`kernels/spread.h`). Resolution doubles from level to level, and planes are carried
-over exactly. In the end each plane has fitted the noise of its own window; averaging those that agree takes that out.
+over exactly. After each level views hand their planes to one another, as in PatchMatch Stereo (Bleyer and others,
+2011). In the end each plane has fitted the noise of its own window; averaging those that agree takes that out.
 Coordinates are array indices, as in `d2_plugin.priors.geometry`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from d2_plugin.errors import D2Error
-from d2_plugin.priors.geometry import check_depth_range, check_views
+from d2_plugin.priors.geometry import check_depth_range, check_views, view_pair
 from d2_plugin.priors.stereo import patchmatch_cuda
 from d2_plugin.priors.stereo.patchmatch_kernel import PatchMatchKernel
-from d2_plugin.priors.stereo.pyramid import LevelView, at_resolution, levels, plane_depth
+from d2_plugin.priors.stereo.pyramid import NO_MATCH, LevelView, at_resolution, levels, plane_depth
 from d2_plugin.priors.stereo.settings import StereoSettings
 from d2_plugin.priors.stereo.source_views import choose_sources
 from d2_plugin.recordings.recording import Camera
@@ -24,6 +26,8 @@ from d2_plugin.recordings.recording import Camera
 ROUNDS = (4, 2, 2, 1)
 """Red-black sweeps at each resolution, coarsest first; each resolution is twice the one before, the last is full. A
 second sweep at full resolution fits noise."""
+OFFERED, BETTER = 0.5, 0.8
+"""Planes of a lower cost are handed to other views, which take them below this share of what their own cost."""
 
 
 def patchmatch(
@@ -66,9 +70,45 @@ def patchmatch(
         for index in range(len(views)):
             # At full size random planes are hardly ever better than those handed down.
             kernel.match(views, index, level, rounds, explore=divisor > 1 or level == 0)
+        _exchange(kernel, views, sources, len(ROUNDS) + level)
     for view in views:
         kernel.average(view)
     return [(plane_depth(view), view.cost) for view in views]
+
+
+def _exchange(kernel: PatchMatchKernel, views: Sequence[LevelView], sources: list[list[int]], stage: int) -> None:
+    """Let each view try the planes of its sources, all as they are now, and keep what matches better."""
+    trials = [
+        replace(view, planes=_handed(view, [views[other] for other in chosen]), cost=np.full_like(view.cost, NO_MATCH))
+        for view, chosen in zip(views, sources)
+    ]
+    for index, (view, trial) in enumerate(zip(views, trials)):
+        kernel.match(trials, index, stage, rounds=1, explore=False)
+        better = trial.cost < BETTER * view.cost
+        view.planes[better], view.cost[better] = trial.planes[better], trial.cost[better]
+
+
+def _handed(view: LevelView, sources: Sequence[LevelView]) -> np.ndarray:
+    """The planes [H, W, 3] of a view, and in their place those of its sources that land there, the best of them last.
+
+    With p' ~ (A + k pi^T) p on a plane pi^T p = 1 / z, the same plane of the other view is A^-T pi / (1 + k^T A^-T pi).
+    """
+    planes, found = view.planes.copy(), []
+    for source in sources:
+        pair, (v, u) = view_pair(source.camera, view.camera), np.nonzero(source.cost < OFFERED)
+        theirs = source.planes[v, u].astype(np.float64)
+        x, y, z = pair.project(u, v, 1 / (theirs[:, 0] * u + theirs[:, 1] * v + theirs[:, 2]))
+        ours = theirs @ np.linalg.inv(pair.A)
+        ours /= 1 + (ours @ pair.k)[:, None]
+        x, y = np.rint(x), np.rint(y)
+        there = (z > 0) & (x >= 0) & (x < view.camera.width) & (y >= 0) & (y < view.camera.height)
+        there &= np.abs((ours[:, 0] * x + ours[:, 1] * y + ours[:, 2]) * z - 1) < 0.5  # none that is seen edge on
+        found.append(np.column_stack([source.cost[v, u], y, x, ours])[there])
+    handed = np.concatenate([*found, np.empty((0, 6))])
+    handed = handed[np.argsort(-handed[:, 0], kind="stable")]
+    row, column = handed[:, 1:3].T.astype(int)
+    planes[row, column] = handed[:, 3:]
+    return planes
 
 
 def _kernel(settings: StereoSettings) -> type[PatchMatchKernel]:
