@@ -48,11 +48,16 @@ class View:
     width: int
     height: int
 
-    def sees(self, points: Tensor) -> Tensor:
-        """Which world points [K, 3] lie before the camera and in its image, hidden or not: bool [K]."""
+    def sees(self, points: Tensor, around: Tensor | float = 0.0) -> Tensor:
+        """Which world points [K, 3] lie before the camera and in its image, hidden or not: bool [K].
+
+        So must all that is within `around` [K] world units of them, to the sides and above and below.
+        """
         pose = self.T_camera_world.to(points)
         x, y, z = ((points @ pose[:3, :3].T + pose[:3, 3]) @ self.K.to(points).T).unbind(-1)
-        return (z > 0) & (x >= 0) & (x < self.width * z) & (y >= 0) & (y < self.height * z)
+        across, down = around * self.K[0, 0].to(points), around * self.K[1, 1].to(points)
+        inside = (x >= across) & (x < self.width * z - across) & (y >= down) & (y < self.height * z - down)
+        return (z > 0) & inside
 
 
 class Splats(NamedTuple):

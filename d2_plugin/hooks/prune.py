@@ -24,6 +24,13 @@ FLOATS = 0.4
 LEAST_LIGHT = 2e-5
 """That light, as a share of all of the evaluation, below which a Gaussian is too small to be worth a hole."""
 
+FAINT = 0.05
+"""A Gaussian that is no larger a part of any pixel of the surveyed views shows nothing that would be missed."""
+
+RIM = 0.1
+"""In the last evaluation a Gaussian's centre must lie in an image by this share of its size: of one whose fringe alone
+is seen most is not, and a held-out camera sees it whole."""
+
 
 @dataclass(frozen=True)
 class PruneConfig(HookConfig):
@@ -36,7 +43,7 @@ class PruneConfig(HookConfig):
     score_stop: Steps | None = None
     """First step from which scores remove nothing more; none: they go on to `stop`. From then on what floats in free
     space goes, however opaque it is: the paper's score forgives that, and a camera that did not train may see little
-    else."""
+    else. So does what is too faint to be seen."""
     every: Every = 100
     """Steps between evaluations."""
     tau_u: Annotated[float, Range(1e-6, 1e6)] = 0.1
@@ -100,6 +107,8 @@ class Sums(NamedTuple):
     weight: Tensor
     maxima: Tensor
     observations: Tensor
+    largest: Tensor
+    """The largest compositing weight in any pixel of any view."""
     front: Tensor
     """Weight in free space, times how deep in it 1 - z / D_near: evidence with the relative error 1, in `error` and
     `weight` as well."""
@@ -107,7 +116,7 @@ class Sums(NamedTuple):
 
 def gather(evaluation: Sequence[Surveyed], count: int, free_space: bool) -> Sums:
     """Sum the surveys of several views per Gaussian."""
-    error, weight, maxima, observations, front = evaluation[0].survey.weight.new_zeros(5, count)
+    error, weight, maxima, observations, largest, front = evaluation[0].survey.weight.new_zeros(6, count)
     for _, splats, _, survey in evaluation:
         if free_space:
             front.index_add_(0, splats.rows, survey.front)
@@ -115,7 +124,8 @@ def gather(evaluation: Sequence[Surveyed], count: int, free_space: bool) -> Sums
         weight.index_add_(0, splats.rows, survey.weight)
         maxima.index_add_(0, splats.rows, survey.max_weight)
         observations.index_add_(0, splats.rows, (survey.max_weight > 0).to(maxima))
-    return Sums(error + front, weight + front, maxima, observations, front)
+        largest.scatter_reduce_(0, splats.rows, survey.max_weight, "amax")
+    return Sums(error + front, weight + front, maxima, observations, largest, front)
 
 
 def floating(sums: Sums) -> Tensor:
@@ -124,16 +134,25 @@ def floating(sums: Sums) -> Tensor:
     return enough & (sums.front > FLOATS * (sums.weight - sums.front))
 
 
-def out_of_sight(evaluation: Sequence[Surveyed], beside: Callable[[View], Sequence[View]], count: int) -> Tensor:
+def faint(sums: Sums) -> Tensor:
+    """Gaussians [N] that are seen, but nowhere by as much as `FAINT`, bool."""
+    return (sums.largest > 0) & (sums.largest < FAINT)
+
+
+def out_of_sight(
+    evaluation: Sequence[Surveyed], beside: Callable[[View], Sequence[View]], count: int, rim: float = 0.0
+) -> Tensor:
     """Gaussians [N] that live in an evaluated view, and whose centre lies in no image of any camera then, bool.
 
-    `beside` gives a view of each camera for an evaluated one; none where they move, and then nothing is said.
+    `beside` gives a view of each camera for an evaluated one; none where they move, and then nothing is said. Centres
+    less than `rim` of a Gaussian's size (root of the trace of its covariance) within an image do not count.
     """
     alive, seen = torch.zeros(2, count, dtype=torch.bool, device=evaluation[0].splats.rows.device)
     for view, splats, _, _ in evaluation:
+        around = rim * splats.covariances[:, [0, 3, 5]].sum(1).sqrt()
         for other in beside(view):
             alive[splats.rows] = True
-            seen[splats.rows] |= other.sees(splats.means)
+            seen[splats.rows] |= other.sees(splats.means, around)
     return alive & ~seen
 
 
@@ -170,14 +189,15 @@ class Prune(Hook):
             contribution = opacity_contribution(sums.maxima, sums.observations)
             high = pruning_score(inconsistency, contribution, config.lambda_e) > config.tau_p
         else:
-            high = floating(sums)
+            high = floating(sums) | faint(sums)
         if self.streak is None:
             self.streak = torch.zeros(count, dtype=torch.int64, device=high.device)
         updated = torch.where(high, self.streak + 1, torch.zeros_like(self.streak))
         self.streak = torch.where(sums.weight > 0, updated, self.streak)
         remove = within_light(self.streak >= config.patience, sums.weight, config.light)
         if config.sight:
-            remove = remove | out_of_sight(context.evaluation, context.beside, count)
+            last = config.stop is not None and context.step + config.every >= config.stop
+            remove = remove | out_of_sight(context.evaluation, context.beside, count, RIM if last else 0.0)
         return Edit(remove=remove) if remove.any() else None
 
     def follow(self, index: Tensor) -> None:

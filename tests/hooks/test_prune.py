@@ -192,7 +192,7 @@ def test_what_is_too_small_to_see_is_no_floater() -> None:
 
     def first_floats(others: float) -> bool:
         error, weight, front = torch.tensor([[1.0, 0], [1.0, others], [0.6, 0]])
-        return bool(floating(Sums(error, weight, torch.ones(2), torch.ones(2), front))[0])
+        return bool(floating(Sums(error, weight, *torch.ones(3, 2), front))[0])
 
     assert not first_floats(1e5)
     assert first_floats(1e4)
