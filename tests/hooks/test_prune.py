@@ -20,6 +20,7 @@ from d2_plugin.hooks.prune import (
     Prune,
     Sums,
     depth_inconsistency,
+    faint,
     floating,
     gather,
     opacity_contribution,
@@ -249,6 +250,29 @@ def test_whose_centre_no_camera_sees_goes_at_once_however_much_of_its_rim_shows(
     pose = views[2].T_camera_world + torch.tensor([[0.0, 0, 0, 1], *3 * [[0] * 4]])
     known.add(replace(views[2], frame=7, T_camera_world=pose))  # other instants of a moving camera may see them
     assert Prune(replace(EVERY_ONE, tau_p=1.0, sight=sight)).edit(found) is None
+
+
+@pytest.mark.parametrize(("step", "goes"), [(1, None), (2, [True, False])])
+def test_in_the_last_evaluation_whose_fringe_alone_is_in_an_image_goes_too(step: int, goes: list[bool] | None) -> None:
+    """Both centres are .05 within the image's left side, at -1.6; a tenth of the first one's size is .14."""
+    view, known = make_views()[1], ViewSampler()
+    known.add(view)
+    variances = torch.tensor([0.8, 0.1])[:, None] ** 2 * torch.tensor([1.0, 0, 0, 1, 0, 1])
+    here = Splats(torch.tensor([[-1.55, 0.0, 3.0]] * 2), variances, torch.full((2,), 0.9), torch.arange(2))
+    assert view.sees(here.means).all()
+    found = replace(context(here, [view], TinyStore().prior("", 0)), step=step, beside=known.beside)
+    edit = Prune(replace(EVERY_ONE, tau_p=1.0, sight=True, every=1, stop=3)).edit(found)
+    assert (None if edit is None else edit.remove.tolist()) == goes
+
+
+def test_what_no_view_shows_by_a_twentieth_of_a_pixel_is_faint_and_what_none_shows_is_not_judged() -> None:
+    largest = torch.tensor([0.0, 1e-6, 0.049, 0.051, 0.9])
+    sums = Sums(*torch.ones(4, 5), largest, torch.zeros(5))
+    assert faint(sums).tolist() == [False, True, True, False, False]
+    here = scattered(0)
+    found = context(here, make_views()[:3], TinyStore().prior("", 0))
+    shown = torch.stack([survey.max_weight for _, _, _, survey in found.evaluation])
+    assert gather(found.evaluation, 40, True).largest.tolist() == shown.amax(0).tolist()
 
 
 def test_the_faintest_go_first_and_the_rest_waits() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import platform
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -14,11 +15,12 @@ from benchmarks.stereo_measure import measure
 from benchmarks.stereo_rigs import Rig, load_rigs, textured_rig
 from d2_plugin.compiler import NoCompiler, find_compiler
 from d2_plugin.errors import D2Error
-from d2_plugin.priors.geometry import scaled_camera
+from d2_plugin.priors.geometry import index_intrinsics, pixel_grid, scaled_camera
 from d2_plugin.priors.settings import StereoSettings
+from d2_plugin.priors.stereo import patchmatch as module
 from d2_plugin.priors.stereo.geometric_depth import gray
-from d2_plugin.priors.stereo.patchmatch import patchmatch
-from d2_plugin.priors.stereo.pyramid import NO_MATCH
+from d2_plugin.priors.stereo.patchmatch import OFFERED, handed_over, patchmatch
+from d2_plugin.priors.stereo.pyramid import NO_MATCH, LevelView
 from d2_plugin.priors.stereo.source_views import choose_sources
 from d2_plugin.recordings.recording import Camera
 
@@ -91,6 +93,61 @@ def test_a_depth_range_ten_times_too_wide_does_no_harm(rig: Rig) -> None:
     assert wide["completeness"] > narrow["completeness"] - 0.02
     assert wide["wrong"] < narrow["wrong"] + 0.01
     assert wide["median"] < 1.1 * narrow["median"]
+
+
+def test_what_one_view_found_helps_the_others_and_is_no_more_often_wrong(
+    rig: Rig, native: Maps, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "_exchange", lambda *arguments: None)
+    alone = raw(rig)
+    assert share_within(native, rig, 0.01) > share_within(alone, rig, 0.01) + 0.01
+
+
+def seen_plane(camera: Camera, normal: np.ndarray, offset: float, cost: float) -> LevelView:
+    """The plane normal^T X = offset of the world as a camera sees it, everywhere in its image."""
+    turned = camera.T_camera_world[:3, :3] @ normal
+    plane = turned @ np.linalg.inv(index_intrinsics(camera)) / (offset + turned @ camera.T_camera_world[:3, 3])
+    image = np.zeros((camera.height, camera.width), np.float32)
+    planes = np.broadcast_to(plane.astype(np.float32), (*image.shape, 3)).copy()
+    return LevelView(camera, image.astype(np.uint8), image.astype(np.uint32), planes, image == 0, image + cost, None)
+
+
+@pytest.mark.parametrize("normal", [(0.0, 0, 1), (0.5, -0.3, 1), (-1.5, 0.2, 1)])
+@pytest.mark.parametrize("unit", [1e-3, 1.0, 1e4])
+def test_a_plane_handed_over_is_the_same_plane_of_the_world(rig: Rig, normal: tuple[float, ...], unit: float) -> None:
+    def placed(camera: Camera) -> Camera:
+        T = camera.T_camera_world.copy()
+        T[:3, 3] *= unit
+        return replace(camera, T_camera_world=T)
+
+    ours, theirs = (placed(camera) for camera in rig.cameras[:2])
+    centre = ours.centre + 0.6 * sum(rig.depth_range) * unit * ours.T_camera_world[2, :3]
+    facing = np.array(normal) @ ours.T_camera_world[:3, :3]
+    target, source = (seen_plane(camera, facing, facing @ centre, 0.1) for camera in (ours, theirs))
+    empty = replace(target, planes=np.zeros_like(target.planes))
+    found = handed_over(empty, [source])
+    there = found.any(-1)
+    u, v = pixel_grid(ours)
+    assert there.mean() > 0.2
+    inverse, right = (planes[..., 0] * u + planes[..., 1] * v + planes[..., 2] for planes in (found, target.planes))
+    np.testing.assert_allclose(inverse[there], right[there], rtol=1e-3)
+
+
+def test_only_good_planes_are_handed_over_the_best_of_them_and_none_seen_edge_on_or_from_behind(rig: Rig) -> None:
+    ours, theirs, third = rig.cameras[:3]
+    ahead = ours.T_camera_world[2, :3]
+    at = [ahead @ ours.centre + share * sum(rig.depth_range) for share in (0.4, 0.6, -0.4)]
+    near, far, behind = (partial(seen_plane, normal=ahead, offset=offset) for offset in at)
+    empty = replace(near(ours, cost=0), planes=np.zeros((ours.height, ours.width, 3), np.float32))
+    assert not handed_over(empty, []).any()
+    assert not handed_over(empty, [near(theirs, cost=OFFERED)]).any()
+    assert not handed_over(empty, [behind(theirs, cost=0.1)]).any()
+    assert not handed_over(empty, [replace(near(theirs, cost=0.1), planes=empty.planes)]).any()  # endlessly far
+    one = handed_over(empty, [near(theirs, cost=0.1)])
+    both = handed_over(empty, [near(theirs, cost=0.1), far(third, cost=0.2)])
+    np.testing.assert_array_equal(both[one.any(-1)], one[one.any(-1)])
+    across = theirs.centre - ours.centre  # a plane through our centre
+    assert np.isfinite(handed_over(empty, [seen_plane(theirs, across, across @ ours.centre, 0.1)])).all()
 
 
 @pytest.mark.parametrize("scale", [1e-3, 1e4])

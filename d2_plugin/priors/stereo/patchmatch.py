@@ -79,7 +79,9 @@ def patchmatch(
 def _exchange(kernel: PatchMatchKernel, views: Sequence[LevelView], sources: list[list[int]], stage: int) -> None:
     """Let each view try the planes of its sources, all as they are now, and keep what matches better."""
     trials = [
-        replace(view, planes=_handed(view, [views[other] for other in chosen]), cost=np.full_like(view.cost, NO_MATCH))
+        replace(
+            view, planes=handed_over(view, [views[other] for other in chosen]), cost=np.full_like(view.cost, NO_MATCH)
+        )
         for view, chosen in zip(views, sources)
     ]
     for index, (view, trial) in enumerate(zip(views, trials)):
@@ -88,23 +90,24 @@ def _exchange(kernel: PatchMatchKernel, views: Sequence[LevelView], sources: lis
         view.planes[better], view.cost[better] = trial.planes[better], trial.cost[better]
 
 
-def _handed(view: LevelView, sources: Sequence[LevelView]) -> np.ndarray:
+def handed_over(view: LevelView, sources: Sequence[LevelView]) -> np.ndarray:
     """The planes [H, W, 3] of a view, and in their place those of its sources that land there, the best of them last.
 
     With p' ~ (A + k pi^T) p on a plane pi^T p = 1 / z, the same plane of the other view is A^-T pi / (1 + k^T A^-T pi).
     """
-    planes, found = view.planes.copy(), []
+    planes, found = view.planes.copy(), [np.empty((0, 6))]
     for source in sources:
         pair, (v, u) = view_pair(source.camera, view.camera), np.nonzero(source.cost < OFFERED)
         theirs = source.planes[v, u].astype(np.float64)
-        x, y, z = pair.project(u, v, 1 / (theirs[:, 0] * u + theirs[:, 1] * v + theirs[:, 2]))
-        ours = theirs @ np.linalg.inv(pair.A)
-        ours /= 1 + (ours @ pair.k)[:, None]
-        x, y = np.rint(x), np.rint(y)
-        there = (z > 0) & (x >= 0) & (x < view.camera.width) & (y >= 0) & (y < view.camera.height)
-        there &= np.abs((ours[:, 0] * x + ours[:, 1] * y + ours[:, 2]) * z - 1) < 0.5  # none that is seen edge on
+        with np.errstate(divide="ignore", invalid="ignore"):  # what is endless, or seen edge on, lands nowhere
+            x, y, z = pair.project(u, v, 1 / (theirs[:, 0] * u + theirs[:, 1] * v + theirs[:, 2]))
+            ours = theirs @ np.linalg.inv(pair.A)
+            ours /= 1 + (ours @ pair.k)[:, None]
+            x, y = np.rint(x), np.rint(y)
+            there = np.abs((ours[:, 0] * x + ours[:, 1] * y + ours[:, 2]) * z - 1) < 0.5
+        there &= (z > 0) & (x >= 0) & (x < view.camera.width) & (y >= 0) & (y < view.camera.height)
         found.append(np.column_stack([source.cost[v, u], y, x, ours])[there])
-    handed = np.concatenate([*found, np.empty((0, 6))])
+    handed = np.concatenate(found)
     handed = handed[np.argsort(-handed[:, 0], kind="stable")]
     row, column = handed[:, 1:3].T.astype(int)
     planes[row, column] = handed[:, 3:]
