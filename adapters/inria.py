@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 
 from d2_plugin.errors import D2Error
+from d2_plugin.gaussians.rotation4d import identity_quaternions
 from d2_plugin.gaussians.spherical_harmonics import coefficients_from_rgb
 from d2_plugin.protocol import Points, RasterSettings, Splats, View
 from d2_plugin.rasterizer import rasterize
@@ -27,7 +28,7 @@ from d2_plugin.rasterizer import rasterize
 from .cameras import inria_view
 from .keys import KeyOf, PriorKey, key_from_image_name
 from .probe import Probe, probe_package
-from .shared import Renders, Resizing, appended, finite, identities, on_device, optional, seen_colors, steps_of_adam
+from .shared import Renders, Resizing, appended, finite, on_device, optional, seen_colors, steps_of_adam
 
 log = logging.getLogger(__name__)
 
@@ -301,7 +302,7 @@ class InriaAdapter(Resizing, ABC):
             features_rest=points.positions.new_zeros(count, *(rest.shape[1:] if rest is not None else (0, 3))),
             opacity=torch.logit(points.opacities, eps=1e-6)[:, None],
             scaling=points.scales.log()[:, None].repeat(1, model._scaling.shape[1]),
-            rotation=identities(count, points.positions),
+            rotation=identity_quaternions(count, points.positions),
         )
 
     def _probed(self, view: View, package: Mapping[str, Any]) -> Probe:

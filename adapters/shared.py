@@ -137,13 +137,6 @@ def seen_colors(
     return harmonic_colors(chosen, splats.means - centre, phase, degree, time_degree)
 
 
-def identities(count: int, like: Tensor) -> Tensor:
-    """Quaternions [count, 4] that turn nothing."""
-    rotations = like.new_zeros(count, 4)
-    rotations[:, 0] = 1
-    return rotations
-
-
 def appended(before: int, after: int, device: torch.device) -> Tensor:
     """The index of a change that appends rows at the end."""
     index = torch.arange(after, device=device)

@@ -18,7 +18,12 @@ from torch import Tensor
 from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.moving import MovingGaussians, moving_gaussians
 from d2_plugin.gaussians.native_slice import STATIC
-from d2_plugin.gaussians.rotation4d import rotation_matrices_3d, temporal_marginal, unit_quaternions
+from d2_plugin.gaussians.rotation4d import (
+    identity_quaternions,
+    rotation_matrices_3d,
+    temporal_marginal,
+    unit_quaternions,
+)
 from d2_plugin.gaussians.slicing import LOG_SCALE_LIMIT, MARGINAL_CUT, rows_to_draw, slice_gaussians
 from d2_plugin.protocol import Points
 from d2_plugin.rasterizer import Splats, View
@@ -26,7 +31,7 @@ from d2_plugin.settings import Seed
 
 from .deform_fields import Box, HexPlaneField, HexPlaneSettings, Offsets
 from .model import SplatModel, SplatSettings, decayed, settled
-from .starting import identity_quaternions, isotropic_rows, lasting_rows
+from .starting import isotropic_rows, lasting_rows
 from .trainer import Trainer, TrainSettings
 
 __all__ = ["Deform", "DeformSettings", "TrainSettings", "Trainer", "create", "settings_from"]

@@ -34,13 +34,6 @@ def lasting_rows(points: Points, longest: float) -> dict[str, Tensor]:
     }
 
 
-def identity_quaternions(count: int, like: Tensor) -> Tensor:
-    """[count, 4], w first, with the dtype and device of `like`."""
-    identity = like.new_zeros(count, 4)
-    identity[:, 0] = 1
-    return identity
-
-
 def nearest_neighbour_scales(positions: Tensor) -> Tensor:
     """Root mean square distance [N] to the three nearest points, or all others if they are fewer, at least 1e-7.
 

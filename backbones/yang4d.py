@@ -16,14 +16,19 @@ from torch import Tensor
 from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.moving import Harmonics, MovingGaussians, moving_gaussians
 from d2_plugin.gaussians.native_slice import STATIC, TEMPORAL
-from d2_plugin.gaussians.rotation4d import rotation_matrices_3d, rotation_matrices_4d, unit_quaternions
+from d2_plugin.gaussians.rotation4d import (
+    identity_quaternions,
+    rotation_matrices_3d,
+    rotation_matrices_4d,
+    unit_quaternions,
+)
 from d2_plugin.gaussians.slicing import slice_gaussians
 from d2_plugin.protocol import Points
 from d2_plugin.rasterizer import Splats, View
 from d2_plugin.settings import Range
 
 from .model import SplatModel, SplatSettings
-from .starting import identity_quaternions, isotropic_rows, lasting_rows
+from .starting import isotropic_rows, lasting_rows
 from .trainer import Trainer, TrainSettings
 
 __all__ = ["TrainSettings", "Trainer", "Yang4D", "Yang4DSettings", "create", "settings_from"]

@@ -100,3 +100,10 @@ def condition_on_time(factors: Tensor) -> tuple[Tensor, Tensor]:
     along = (spatial * axis).sum(1) / (1 + unit[3] * sign)
     rotated = spatial - along[:, None] * axis
     return rotated[:, :3], rotated[:, 3] / (-sign * length)
+
+
+def identity_quaternions(count: int, like: Tensor) -> Tensor:
+    """[count, 4], w first, with the dtype and device of `like`."""
+    identity = like.new_zeros(count, 4)
+    identity[:, 0] = 1
+    return identity
