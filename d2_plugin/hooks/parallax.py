@@ -17,6 +17,7 @@ from torch import Tensor
 
 from d2_plugin.hooks.densify import INSTANTS, MovingPixels
 from d2_plugin.hooks.hook import Context, HookConfig, ImageHook
+from d2_plugin.hooks.prior import camera_centre
 from d2_plugin.protocol import DepthPrior, View
 from d2_plugin.settings import Every, Range
 
@@ -139,7 +140,8 @@ def on_the_way(view: View, other: View, part: float) -> View:
     left[:, 2] *= torch.linalg.det(left @ right)  # no reflection, where they look in opposite directions
     pose = view.T_camera_world.clone()
     pose[:3, :3] = left @ right  # the rotation that is nearest to the blend
-    pose[:3, 3] = -pose[:3, :3] @ torch.lerp(_centre(view), _centre(other), part)
+    centres = camera_centre(view.T_camera_world), camera_centre(other.T_camera_world)
+    pose[:3, 3] = -pose[:3, :3] @ torch.lerp(*centres, part)
     return replace(view, T_camera_world=pose)
 
 
@@ -163,11 +165,6 @@ def in_sight(aside: View, own: Side, other: Side) -> tuple[Tensor, Tensor]:
     hidden = depth * HIDES >= nearest[_index(aside, places)]
     known = inside & met & other.prior.trusted.flatten()[there] & same & ~hidden
     return pixels[known].int(), places[:, known]
-
-
-def _centre(view: View) -> Tensor:
-    """Where the camera stands, [3]."""
-    return -view.T_camera_world[:3, :3].T @ view.T_camera_world[:3, 3]
 
 
 def _surface(view: View, prior: DepthPrior) -> tuple[Tensor, Tensor]:

@@ -159,7 +159,7 @@ class CameraCheck:
     def _check_pose(self, view: View, first: View, here: Tensor, built: Tensor, slack: float) -> None:
         """Compare poses [4, 4] relative to the first view's; `slack` is a distance."""
         angle = _angle(here[:3, :3] @ built[:3, :3].T)
-        centres = _centre(here), _centre(built)
+        centres = camera_centre(here), camera_centre(built)
         if angle > ANGLE_TOLERANCE or float((centres[0] - centres[1]).norm()) > slack:
             raise D2Error(
                 f"the prior of camera {view.camera}, frame {view.frame} was built for a camera at {_text(centres[1])} "
@@ -406,7 +406,8 @@ def _angle(rotation: Tensor) -> float:
     return math.degrees(math.atan2(sine, float((rotation.diagonal().sum() - 1) / 2)))
 
 
-def _centre(pose: Tensor) -> Tensor:
+def camera_centre(pose: Tensor) -> Tensor:
+    """Where the camera of a pose [4, 4] stands, [3]."""
     return -pose[:3, :3].T @ pose[:3, 3]
 
 
