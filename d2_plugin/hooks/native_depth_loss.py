@@ -39,11 +39,7 @@ class _Call(ctypes.Structure):
 
 @functools.cache
 def library() -> ctypes.CDLL | None:
-    """The compiled kernel; None without a compiler.
-
-    Raises:
-        CompileError: see `d2_plugin.compiler.kernels.load_kernel`.
-    """
+    """The compiled kernel; None without a compiler. Raises CompileError as `d2_plugin.compiler.kernels.load_kernel`."""
     results = {"d2_depth_loss": ctypes.c_double}
     return load_kernel("depth_loss", (SOURCE,), HEADERS, FLAGS, {"depth_loss": _Call}, results, optional=True)
 

@@ -67,11 +67,7 @@ class Frame(PointingFrame):
 
 @functools.cache
 def library() -> Any:
-    """The compiled kernels.
-
-    Raises:
-        NoCompiler, CompileError: see `d2_plugin.compiler.load_library`.
-    """
+    """The compiled kernels, or what `d2_plugin.compiler.load_library` raises: NoCompiler, CompileError."""
     results = {"d2_tile_count": ctypes.c_int32, "d2_project": ctypes.c_int64}
     kernels = load_kernel("rasterizer", SOURCES, HEADERS, FLAGS, {"frame": Frame}, results)
     for name in ("d2_render", "d2_survey", "d2_backward"):

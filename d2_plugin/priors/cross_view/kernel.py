@@ -116,11 +116,7 @@ _NUMBERS = {
 
 @functools.cache
 def library() -> Any:
-    """The compiled kernel.
-
-    Raises:
-        NoCompiler, CompileError: see `d2_plugin.compiler.load_library`.
-    """
+    """The compiled kernel, or what `d2_plugin.compiler.load_library` raises: NoCompiler, CompileError."""
     calls = {"instant": _Instant, "pair": _Pair, "view": _View}
     return load_kernel("cross_view", (SOURCE,), HEADERS, FLAGS, calls, {"d2_compare_views": None})
 

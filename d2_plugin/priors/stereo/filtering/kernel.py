@@ -51,11 +51,7 @@ CALLS = {
 
 @functools.cache
 def library() -> Any:
-    """The compiled kernel.
-
-    Raises:
-        NoCompiler, CompileError: see `d2_plugin.compiler.load_library`.
-    """
+    """The compiled kernel, or what `d2_plugin.compiler.load_library` raises: NoCompiler, CompileError."""
     return load_kernel("filter", SOURCES, HEADERS, FLAGS, CALLS, dict.fromkeys(f"d2_{name}" for name in CALLS))
 
 
