@@ -80,11 +80,6 @@ def ssim_range1(image: Tensor, truth: Tensor) -> float:
     return ssim_uniform(image, truth, data_range=1.0)
 
 
-def ssim_range2(image: Tensor, truth: Tensor) -> float:
-    """SSIM_2: the same with a data range of 2, scikit-image's old default for floats."""
-    return ssim_uniform(image, truth, data_range=2.0)
-
-
 def ssim_uniform(image: Tensor, truth: Tensor, data_range: float) -> float:
     """Structural similarity with a uniform 7x7 window and sample covariance, mean over windows inside the image."""
     first, second = _pair(image, truth, UNIFORM_WINDOW)
@@ -276,7 +271,7 @@ METRICS = {
     ),
     "ssim2": Metric(
         "uniform 7x7 window, sample covariance, 3 px border dropped, data range 2 (scikit-image)",
-        lambda c: ssim_range2(c.image, c.truth),
+        lambda c: ssim_uniform(c.image, c.truth, data_range=2.0),  # scikit-image's old default for floats
     ),
     "ssim_3dgs": Metric(
         "Gaussian 11x11 window with sigma 1.5, zero padding, biased covariance (3DGS)",
