@@ -97,18 +97,14 @@ def rendered_depth(depth_sum: Tensor, alpha: Tensor, tau_v: float) -> tuple[Tens
     return torch.where(valid, depth_sum, torch.zeros_like(depth_sum)) / safe, valid
 
 
-def relative_discrepancy(depth: Tensor, prior: Tensor) -> Tensor:
-    """delta = |D_hat - D*| / (D* + eps), [H, W]; meaningful where the prior has support (D* > 0)."""
-    return torch.abs(depth - prior) / (prior + EPSILON)
-
-
 def under_reconstructed(depth: Tensor, valid: Tensor, prior: Tensor, support: Tensor, tau_u: float | Tensor) -> Tensor:
     """U: pixels of the prior's support where nothing valid is rendered, or at another depth; bool [H, W].
 
     `depth`, `valid` are D_hat and M^r; `tau_u` may be a map [H, W], since a mono-only depth is less exact than a
     verified one.
     """
-    return support & (~valid | (relative_discrepancy(depth, prior) > tau_u))
+    delta = torch.abs(depth - prior) / (prior + EPSILON)  # meaningful where the prior has support (D* > 0)
+    return support & (~valid | (delta > tau_u))
 
 
 def back_project(view: View, pixels: Tensor, depth: Tensor) -> Tensor:

@@ -21,11 +21,6 @@ def limited(mask: Tensor, share: float, step: int) -> Tensor:
         return mask
     message = "step %d: the hooks would remove %d of %d Gaussians, and at most %d go in one step (remove_at_most)"
     _log.warning(message, step, asked, len(mask), most)
-    return spread_over(mask, most)
-
-
-def spread_over(mask: Tensor, most: int) -> Tensor:
-    """`most` of the True rows of `mask` [N], spread evenly over them."""
     rows = torch.nonzero(mask).squeeze(1)
     chosen = torch.arange(most, device=mask.device) * len(rows) // max(most, 1)
     return torch.zeros_like(mask).index_fill(0, rows[chosen], True)
