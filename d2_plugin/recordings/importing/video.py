@@ -146,7 +146,9 @@ def read_video(path: Path) -> VideoFile:
             raise D2Error(f"{shown_path(path)} holds {kinds} and no image: give a video of the camera")
         stream = container.streams.video[0]
         counted, unit = container.format.name == "avi", Fraction(stream.time_base)
-        stamps, keys = _stamps(container.decode(stream) if counted else _packets(container, stream), path)
+        # Packets that hold a frame that is shown: an edit list may leave some out.
+        packets = (packet for packet in container.demux(stream) if packet.size and not packet.is_discard)
+        stamps, keys = _stamps(container.decode(stream) if counted else packets, path)
         places = [container, *container.streams.video, *container.streams]
         timecode = next((place.metadata["timecode"] for place in places if "timecode" in place.metadata), None)
         sound = bool(container.streams.audio)
@@ -157,11 +159,6 @@ def read_video(path: Path) -> VideoFile:
     ]
     size, hdr = (first.width, first.height), ", ".join(coding)
     return VideoFile(path, size, turn, stamps, unit, timecode, sound, counted, keys, hdr)
-
-
-def _packets(container: Any, stream: Any) -> Iterator[Any]:
-    """Those that hold a frame that is shown: an edit list may leave some out."""
-    return (packet for packet in container.demux(stream) if packet.size and not packet.is_discard)
 
 
 def _stamps(shown: Iterator[Any], path: Path) -> tuple[np.ndarray, tuple[int, ...]]:

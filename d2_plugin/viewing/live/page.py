@@ -187,15 +187,11 @@ class Page:
         times = [float(np.interp(place, range(len(chain)), [key.time for key in keys])) for place in places]
         return [(between(chain, place), instant) for place, instant in zip(places, times)]
 
-    def path_file(self) -> bytes:
-        """The path as nerfstudio's camera_path.json."""
-        path = self.path()
-        shares = [instant / max(self.viewed.duration, 1e-9) for _, instant in path]
-        return camera_path_text([camera for camera, _ in path], shares, PATH_RATE).encode()
-
     def _save(self) -> None:
-        if self.keyframes:
-            self.client.send_file_download("camera_path.json", self.path_file(), save_immediately=True)
+        if path := self.path():
+            shares = [instant / max(self.viewed.duration, 1e-9) for _, instant in path]
+            content = camera_path_text([camera for camera, _ in path], shares, PATH_RATE).encode()
+            self.client.send_file_download("camera_path.json", content, save_immediately=True)
 
     def _preview(self) -> None:
         self._previewed = time.monotonic(), self.path()

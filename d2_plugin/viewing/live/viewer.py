@@ -123,7 +123,8 @@ class Viewer:
     def close(self) -> None:
         """Take the page away and let go of the trainer."""
         if self._followed is not None:
-            self._followed.let_go()
+            for name in ("loss", "step"):  # the trainer's own methods again
+                vars(self._followed.d2).pop(name, None)
         with redirect_stdout(io.StringIO()):
             self._server.stop()
 
@@ -226,11 +227,6 @@ class Follower:
         viewer.marks = lambda: d2.inserted_at
         self._plain_loss, self._plain_step = d2.loss, d2.step
         d2.loss, d2.step = self._loss, self._step  # type: ignore[method-assign]
-
-    def let_go(self) -> None:
-        """The trainer's own methods again."""
-        for name in ("loss", "step"):
-            vars(self.d2).pop(name, None)
 
     def _loss(self, step: int, views: object) -> Any:
         result = self._plain_loss(step, views)
