@@ -96,7 +96,9 @@ class HexPlaneField(nn.Module):
         self.space = nn.ParameterList(grids)
         self.time = nn.ParameterList(torch.ones(3, channels, instants, r) for r in settings.resolutions)
         self.features = linear(channels * len(settings.resolutions), HIDDEN, generator)
-        self.heads = zero_linear(HIDDEN, sum(SPLITS))
+        self.heads = nn.utils.skip_init(nn.Linear, HIDDEN, sum(SPLITS))
+        nn.init.zeros_(self.heads.weight)
+        nn.init.zeros_(self.heads.bias)
 
     def forward(self, positions: Tensor, fraction: float) -> Offsets:
         """Offsets of `positions` [N, 3] (world; no gradient) at `fraction` of the duration, clamped to 0..1.
@@ -168,12 +170,4 @@ def linear(inputs: int, outputs: int, generator: torch.Generator) -> nn.Linear:
     with torch.no_grad():
         layer.weight.uniform_(-bound, bound, generator=generator)
         layer.bias.uniform_(-bound, bound, generator=generator)
-    return layer
-
-
-def zero_linear(inputs: int, outputs: int) -> nn.Linear:
-    """A layer that starts at zero."""
-    layer = nn.utils.skip_init(nn.Linear, inputs, outputs)
-    nn.init.zeros_(layer.weight)
-    nn.init.zeros_(layer.bias)
     return layer
