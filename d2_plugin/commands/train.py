@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from d2_plugin.commands.arguments.form import Form, Given
 from d2_plugin.commands.arguments.recording import (
@@ -17,10 +16,6 @@ from d2_plugin.commands.arguments.recording import (
 )
 from d2_plugin.errors import D2Error
 from d2_plugin.progress import show
-
-if TYPE_CHECKING:
-    from d2_plugin.runs.run import Run
-    from d2_plugin.viewing.live.show import LiveRun
 
 OF_THE_RUN = (
     *("test_cameras", "backbone", "iterations", "hooks", "priors", "accept_empty_prior"),
@@ -60,7 +55,13 @@ def run(given: Given) -> str:
     run = Run(run_settings(given), options.output)
     show_notes(run.scene.recording.notes)
     show_plan(run.scene.plan)
-    live = _live(run) if options.view else None
+    live = None
+    if options.view:
+        from d2_plugin.extras import imported
+        from d2_plugin.viewing.live.show import LiveRun
+
+        imported("viser", "viser", "view", "the live viewer")  # asked for before anything is computed
+        live = LiveRun(run)
     run.train(on_prior=lambda summary: show(str(summary)), watch=None if live is None else live.watch)
     if run.trials is not None:
         show(run.trials["text"])
@@ -100,12 +101,3 @@ def _refuse_videos(path: Path) -> None:
             f"{path} holds videos and no calibration that goes with them: give it with --calibration FILE, or let "
             "`d2 import` find one first"
         )
-
-
-def _live(run: Run) -> LiveRun:
-    """The page of a run; its package is asked for before anything is computed."""
-    from d2_plugin.extras import imported
-    from d2_plugin.viewing.live.show import LiveRun
-
-    imported("viser", "viser", "view", "the live viewer")
-    return LiveRun(run)

@@ -107,6 +107,8 @@ class RunSettings(Settings):
 
 def check(settings: RunSettings) -> RunSettings:
     """The same settings with absolute paths, or a D2Error for what cannot be."""
+    import torch
+
     if not settings.train_cameras:
         raise D2Error("no training camera: name at least one with --train-cameras")
     for name in settings.hooks:
@@ -114,7 +116,8 @@ def check(settings: RunSettings) -> RunSettings:
             raise unknown_name("hook", name, [*HOOK_NAMES, "all", "none"])
     if settings.mono_onnx and settings.mono_kind is None:
         raise D2Error("--mono-onnx needs --mono-kind relative (inverse depth) or metric (depth): the file names none")
-    _check_device(settings.device)
+    if settings.device == "cuda" and not torch.cuda.is_available():
+        raise D2Error("--device cuda, but torch finds no CUDA device here: leave out --device to train on the CPU")
     _check_overrides(settings)
     paths = ("recording", "mono_onnx", "multiview", "priors")
     absolute = {name: _absolute(path, name) for name in paths if (path := getattr(settings, name)) is not None}
@@ -128,13 +131,6 @@ def _absolute(path: str, name: str) -> str:
         return str(Path(path).resolve())
     except (OSError, ValueError, RuntimeError) as failure:  # a zero byte, a name too long, links in a circle
         raise D2Error(f"{name} is {shown_path(path)[:200]}, which is no path ({said(failure)}): correct it") from None
-
-
-def _check_device(name: str) -> None:
-    import torch
-
-    if name == "cuda" and not torch.cuda.is_available():
-        raise D2Error("--device cuda, but torch finds no CUDA device here: leave out --device to train on the CPU")
 
 
 def _check_overrides(settings: RunSettings) -> None:
