@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from d2_plugin.errors import D2Error
-from d2_plugin.gaussians.rotation4d import identity_quaternions, unit_quaternions
+from d2_plugin.gaussians.rotation4d import identities, unit_quaternions
 from d2_plugin.gaussians.spherical_harmonics import coefficients_from_rgb
 from d2_plugin.protocol import Points, RasterSettings, Splats, View
 
@@ -177,7 +177,7 @@ class GsplatAdapter(Resizing):
         known = {
             "means": points.positions,
             "scales": points.scales.log()[:, None].repeat(1, 3),
-            "quats": identity_quaternions(count, like),
+            "quats": identities(count, like),
             "opacities": torch.logit(points.opacities, eps=1e-6),
             "sh0": coefficients_from_rgb(points.colors, 0, 0),
             "colors": torch.logit(points.colors, eps=1e-3),

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from d2_plugin.errors import D2Error
-from d2_plugin.gaussians.rotation4d import identity_quaternions
+from d2_plugin.gaussians.rotation4d import identities
 from d2_plugin.gaussians.spherical_harmonics import coefficients_from_rgb
 from d2_plugin.protocol import Points, RasterSettings, Splats, View
 from d2_plugin.rasterizer import rasterize
@@ -302,7 +302,7 @@ class InriaAdapter(Resizing, ABC):
             features_rest=points.positions.new_zeros(count, *(rest.shape[1:] if rest is not None else (0, 3))),
             opacity=torch.logit(points.opacities, eps=1e-6)[:, None],
             scaling=points.scales.log()[:, None].repeat(1, model._scaling.shape[1]),
-            rotation=identity_quaternions(count, points.positions),
+            rotation=identities(count, points.positions),
         )
 
     def _probed(self, view: View, package: Mapping[str, Any]) -> Probe:

@@ -18,12 +18,7 @@ from torch import Tensor
 from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.moving import MovingGaussians, moving_gaussians
 from d2_plugin.gaussians.native_slice import STATIC
-from d2_plugin.gaussians.rotation4d import (
-    identity_quaternions,
-    rotation_matrices_3d,
-    temporal_marginal,
-    unit_quaternions,
-)
+from d2_plugin.gaussians.rotation4d import identities, rotation_matrices_3d, temporal_marginal, unit_quaternions
 from d2_plugin.gaussians.slicing import LOG_SCALE_LIMIT, MARGINAL_CUT, rows_to_draw, slice_gaussians
 from d2_plugin.protocol import Points
 from d2_plugin.rasterizer import Splats, View
@@ -81,7 +76,7 @@ class Deform(SplatModel):
     def initial_rows(points: Points, settings: DeformSettings, duration: float) -> dict[str, Tensor]:
         """See `SplatModel.initial_rows`; without lifetimes they are always there, and the field says where."""
         rows = isotropic_rows(points, settings.sh_degree)
-        rows["rotations"] = identity_quaternions(len(points.positions), points.positions)
+        rows["rotations"] = identities(len(points.positions), points.positions)
         if settings.temporal:
             rows |= lasting_rows(points, LASTING * max(duration, 1e-12))
         return rows

@@ -16,12 +16,7 @@ from torch import Tensor
 from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.moving import Harmonics, MovingGaussians, moving_gaussians
 from d2_plugin.gaussians.native_slice import STATIC, TEMPORAL
-from d2_plugin.gaussians.rotation4d import (
-    identity_quaternions,
-    rotation_matrices_3d,
-    rotation_matrices_4d,
-    unit_quaternions,
-)
+from d2_plugin.gaussians.rotation4d import identities, rotation_matrices_3d, rotation_matrices_4d, unit_quaternions
 from d2_plugin.gaussians.slicing import slice_gaussians
 from d2_plugin.protocol import Points
 from d2_plugin.rasterizer import Splats, View
@@ -61,7 +56,7 @@ class Yang4D(SplatModel):
         shorter.
         """
         rows = isotropic_rows(points, settings.sh_degree, _time_degree(settings))
-        rows["left"] = identity_quaternions(len(points.positions), points.positions)
+        rows["left"] = identities(len(points.positions), points.positions)
         if settings.temporal:
             rows |= lasting_rows(points, math.sqrt(max(duration, 1e-12) / 5))
             rows["right"] = rows["left"].clone()

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from d2_plugin.errors import D2Error
-from d2_plugin.gaussians.rotation4d import identity_quaternions
+from d2_plugin.gaussians.rotation4d import identities
 from d2_plugin.gaussians.slicing import slice_gaussians
 from d2_plugin.gaussians.spherical_harmonics import coefficients_from_rgb
 from d2_plugin.protocol import Points, RasterSettings, Splats, View
@@ -137,8 +137,8 @@ class FasterGS4DAdapter(Resizing):
             "opacities": torch.logit(points.opacities, eps=1e-6)[:, None],
             "spatial_scales": points.scales.log()[:, None].repeat(1, 3),
             "temporal_scales": extents,
-            "left_isoclinic_rotations": identity_quaternions(count, points.positions),
-            "right_isoclinic_rotations": identity_quaternions(count, points.positions),
+            "left_isoclinic_rotations": identities(count, points.positions),
+            "right_isoclinic_rotations": identities(count, points.positions),
         }
 
     def _watch(self, name: str, kept: Callable[[Tensor], Tensor]) -> None:

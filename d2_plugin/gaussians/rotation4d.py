@@ -102,8 +102,8 @@ def condition_on_time(factors: Tensor) -> tuple[Tensor, Tensor]:
     return rotated[:, :3], rotated[:, 3] / (-sign * length)
 
 
-def identity_quaternions(count: int, like: Tensor) -> Tensor:
-    """[count, 4], w first, with the dtype and device of `like`."""
+def identities(count: int, like: Tensor) -> Tensor:
+    """Quaternions [count, 4], w first, that turn nothing, with the dtype and device of `like`."""
     identity = like.new_zeros(count, 4)
     identity[:, 0] = 1
     return identity
