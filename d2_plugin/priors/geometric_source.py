@@ -16,7 +16,7 @@ import numpy as np
 from d2_plugin.priors.frame import Frame, describe_camera
 from d2_plugin.priors.stereo.depth_range import DepthBounds
 from d2_plugin.priors.stereo.filtering.filter import GeometricDepth
-from d2_plugin.priors.stereo.settings import StereoSettings
+from d2_plugin.priors.stereo.settings import DEPENDS_ON, StereoSettings
 from d2_plugin.recordings.recording import Camera
 from d2_plugin.store.files import Entry, EntryFolder, hash_of
 from d2_plugin.store.maps import SIGMA, DepthRange, encode_sigma
@@ -69,7 +69,7 @@ class GeometricSource(ABC):
             self._keys[frame.number] = hash_of(
                 VERSION,
                 self.matcher,
-                self.settings.that_decide(self.matcher),
+                {name: getattr(self.settings, name) for name in DEPENDS_ON[self.matcher]},
                 None if self.bounds is None else list(self.bounds[:2]),
                 [describe_camera(camera) for camera in self.cameras],
                 [frame.hashes[camera.name] for camera in self.cameras],

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from d2_plugin.errors import D2Error
 from d2_plugin.settings import Angle, Range, Seed, Settings, Share
@@ -69,7 +69,3 @@ class StereoSettings(Settings):
                 f"setting StereoSettings.min_angle must be below max_angle, got {self.min_angle:g} and "
                 f"{self.max_angle:g} degrees: no depth could survive"
             )
-
-    def that_decide(self, matcher: str) -> dict[str, Any]:
-        """The settings that the depth of a matcher depends on (`DEPENDS_ON`), by name."""
-        return {name: getattr(self, name) for name in DEPENDS_ON[matcher]}
