@@ -52,6 +52,14 @@ def refused(capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
 
 
 @pytest.fixture
+def answered(capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
+    """What a command line that does its work prints."""
+    import command_lines  # after the environment is set above
+
+    return partial(command_lines.answered, capsys)
+
+
+@pytest.fixture
 def threads() -> Iterator[Callable[[int], None]]:
     """Sets torch's number of threads for a test."""
     import torch  # after the environment is set above

@@ -77,9 +77,7 @@ HAS = {
     ],
     ids=["nothing", "NVRTC", "a newer driver", "a driver", "a torch with CUDA"],
 )
-def test_what_a_machine_lacks_is_named_with_what_to_do(
-    lacks: dict, says: dict[str, str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_a_machine_lacks_is_named_with_what_to_do(lacks: dict, says: dict[str, str], monkeypatch) -> None:
     report = machine(monkeypatch, **lacks)
     assert all(sentence in report[part] for part, sentence in says.items())
     assert report == HAS or lacks

@@ -9,18 +9,7 @@ from types import ModuleType, SimpleNamespace
 from typing import Any, NamedTuple
 
 import torch
-from mimics import (
-    cem4dgs,
-    deformable3d,
-    ex4dgs,
-    fastergs4d,
-    fudan,
-    gsplat,
-    gsplat_dynamic,
-    hust4d,
-    spacetime,
-    swift4d,
-)
+from mimics import cem4dgs, deformable3d, ex4dgs, fastergs4d, fudan, gsplat, gsplat_dynamic, hust4d, spacetime, swift4d
 from mimics.inria import default_options, kept
 from tiny import make_views
 from torch import Tensor

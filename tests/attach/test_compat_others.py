@@ -36,7 +36,7 @@ class TestSpacetime:
         """The lite trainer gives nine background values for three channels (train.py:90)."""
         colors = torch.rand(40, channels, generator=torch.Generator().manual_seed(1)).to(scene.means)
         raster = spacetime.GaussianRasterizer(
-            spacetime.GaussianRasterizationSettings(**{**camera, "bg": torch.zeros(9)}),
+            spacetime.GaussianRasterizationSettings(**{**camera, "bg": torch.zeros(9)})
         )
         color, radii, depths = raster(
             means3D=scene.means, means2D=torch.zeros(40, 3), opacities=scene.opacities[:, None],

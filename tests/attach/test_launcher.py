@@ -177,9 +177,7 @@ class TestOriginals:
             provide((Original(self.NAME, STAND_IN, "built.py"),), tmp_path, on_cpu=False, replace_broken=False)
 
     @pytest.mark.parametrize(("built", "works"), [("object()", True), ("None", False)])
-    def test_gsplat_is_what_its_own_loader_loads_or_builds(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, built: str, works: bool
-    ) -> None:
+    def test_gsplat_is_what_its_own_loader_loads_or_builds(self, tmp_path, monkeypatch, built, works) -> None:
         """As PyPI ships it, it builds its kernels at first use and never has `gsplat.csrc`."""
         for name in [name for name in sys.modules if name.split(".")[0] == "gsplat"]:
             monkeypatch.delitem(sys.modules, name)

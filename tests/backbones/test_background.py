@@ -7,16 +7,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from tiny import (
-    ALL_HOOKS,
-    BACKBONES,
-    TinyFrames,
-    TinyStore,
-    make_adapter,
-    make_model,
-    make_trainer,
-    make_views,
-)
+from tiny import ALL_HOOKS, BACKBONES, TinyFrames, TinyStore, make_adapter, make_model, make_trainer, make_views
 from torch import Tensor
 
 from d2_plugin.backbones import background as module

@@ -11,7 +11,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from benchmarks import memory, scaling
-from benchmarks.__main__ import main
 from benchmarks.memory import in_fresh_process
 from benchmarks.report import EVERY
 from benchmarks.work_precision import means, pareto_front, work_precision
@@ -25,7 +24,7 @@ LINUX = pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="p
 
 
 def test_parts_are_found_from_any_folder_and_a_mistake_is_one_sentence(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch, capsys, refused
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [place for place in sys.path if Path(place).resolve() != CHECKOUT])
@@ -35,8 +34,7 @@ def test_parts_are_found_from_any_folder_and_a_mistake_is_one_sentence(
     said = capsys.readouterr().err
     assert "did you mean 'stereo'?" in said
     assert len(said.splitlines()) == 1
-    assert main(["raster", "--sizes", "1"]) == 2
-    assert "WIDTHxHEIGHT" in capsys.readouterr().err
+    assert "WIDTHxHEIGHT" in refused("raster", "--sizes", "1")
 
 
 @pytest.mark.parametrize(
@@ -54,13 +52,12 @@ def test_a_part_adds_rows_of_what_it_measured_and_prints_their_tables(
     rows: int,
     shown: str,
     tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+    answered,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("torch.set_num_threads", lambda count: None)
     monkeypatch.setattr(scaling, "in_fresh_process", lambda work, *given: memory.Measured(work(*given), 1.0))
-    assert main([*words.split(), "--output", str(tmp_path / "rows.jsonl")]) == 0
-    assert shown in capsys.readouterr().out
+    assert shown in answered(*words.split(), "--output", str(tmp_path / "rows.jsonl"))
     found = read_rows([tmp_path / "rows.jsonl"])
     assert len(found) == rows
     begins = f"python -m benchmarks {words.split()[0]}"

@@ -47,9 +47,7 @@ def loss_with_gradient(
     + [((20, 30, 3), weight) for weight in (1e-3, 1.0)],
 )
 @pytest.mark.parametrize("transposed", [False, True], ids=["", "transposed"])
-def test_value_and_gradient_are_those_of_torch_in_float64(
-    shape: tuple[int, int, int], weight: float, transposed: bool
-) -> None:
+def test_value_and_gradient_are_those_of_torch_in_float64(shape, weight, transposed) -> None:
     image, target = images(*shape)
     if transposed:  # and so not contiguous
         image, target = image.transpose(0, 1), target.flip(0).transpose(0, 1)

@@ -115,9 +115,7 @@ class TestKernel:
                     assert not slope[known.kind == 0].any()
 
     @pytest.mark.parametrize("scale", [1e-20, 1e20, 1e30])
-    def test_depths_beyond_the_range_of_squares_are_as_in_torch(
-        self, scale: float, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
+    def test_depths_beyond_the_range_of_squares_are_as_in_torch(self, scale: float, monkeypatch) -> None:
         prior, (depth_sum, alpha) = prior_of(5, 20, 30), render_of(20, 30)
         native = loss_and_gradients((scale * depth_sum, alpha), prior)
         monkeypatch.setattr(module, "can_compare", lambda *parts: False)
@@ -325,9 +323,7 @@ class TestStiff:
         assert by_sum[0, [1, 9]].lt(0).all()
 
 
-def test_the_outline_of_a_sky_says_nothing_and_the_rim_of_the_image_is_no_outline(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_the_outline_of_a_sky_says_nothing_and_the_rim_of_the_image_is_no_outline(monkeypatch) -> None:
     monkeypatch.setattr(loading, "OUTLINE", 2)
     labels = torch.full((10, 12), int(Label.VERIFIED), dtype=torch.uint8)
     labels[:6] = int(Label.FAR)

@@ -135,9 +135,7 @@ def turned(name: str, mono: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("wrong", [noise, turned, lambda name, mono: mono.max() - mono])
-def test_maps_that_show_no_common_surface_are_told_nothing(
-    room: Recording, wrong: Callable[[str, np.ndarray], np.ndarray]
-) -> None:
+def test_maps_that_show_no_common_surface_are_told_nothing(room, wrong) -> None:
     views = shown(room, turned=wrong)
     assert not [view for view in aligned_across(views, "relative").values() if view.status is AlignStatus.ACROSS]
 

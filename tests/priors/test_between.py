@@ -150,9 +150,7 @@ class TestFlights:
 
 
 class TestHalfway:
-    def test_a_thrown_ball_is_on_its_parabola_with_its_depth_and_nothing_is_there_twice(
-        self, flown: PriorStore
-    ) -> None:
+    def test_a_thrown_ball_is_on_its_parabola_with_its_depth_and_nothing_is_there_twice(self, flown) -> None:
         for frame, quarter in itertools.product(range(4), QUARTERS):
             following, halfway = flown.underway("cam1", frame, quarter)
             assert following == frame + 1

@@ -72,9 +72,7 @@ def test_maps_that_differ_by_more_than_the_tolerance_do_not_and_both_are_less_su
 
 
 @pytest.mark.parametrize("factor", [0.96, 0.99, 1.0, 1.02, 1.05])
-def test_a_surface_that_another_camera_verified_is_taken_along_the_ray_and_is_no_stereo_of_its_own(
-    factor: float,
-) -> None:
+def test_a_surface_that_another_camera_verified_is_taken_along_the_ray_and_is_no_stereo_of_its_own(factor) -> None:
     truth, theirs = slanted("left"), slanted("right")
     compared = left_of(prior_of(truth * factor), prior_of(theirs, Label.VERIFIED, 0.001))
     met = compared.labels == Label.AGREED

@@ -159,9 +159,7 @@ def test_images_may_differ_in_size(rig: Rig) -> None:
 
 
 @pytest.mark.skipif(platform.machine() != "x86_64", reason="the oldest x86-64 is meant")
-def test_a_processor_without_wide_vectors_finds_the_same(
-    rig: Rig, native: Maps, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_processor_without_wide_vectors_finds_the_same(rig: Rig, native: Maps, monkeypatch) -> None:
     monkeypatch.setenv("D2_CXXFLAGS", "-march=x86-64")
     plain = raw(rig)
     assert share_within(plain, rig, 0.01) == pytest.approx(share_within(native, rig, 0.01), abs=0.02)

@@ -273,9 +273,7 @@ def test_more_pairs_than_slots_can_number_are_refused() -> None:
 
 
 @pytest.mark.cuda
-def test_on_a_device_its_kernels_draw_on_the_current_stream_and_a_prior_may_lie_on_the_cpu(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_on_a_device_its_kernels_draw_on_the_current_stream_and_a_prior_may_lie_on_the_cpu(monkeypatch) -> None:
     path = path_of("cuda", monkeypatch)
     monkeypatch.setattr(reference, "rasterize", None)
     monkeypatch.setattr(reference, "survey", None)

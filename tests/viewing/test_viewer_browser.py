@@ -95,9 +95,7 @@ def control(page: Page, label: str) -> Any:
 
 
 @pytest.mark.slow
-def test_a_person_moves_camera_and_time_while_another_only_looks(
-    new_page: Callable[[], Page], viewed: ViewedRun
-) -> None:
+def test_a_person_moves_camera_and_time_while_another_only_looks(new_page, viewed) -> None:
     with showing(viewed) as viewer:
         one, two = opened(new_page, viewer), opened(new_page, viewer)
         first, other = settled(one), settled(two)

@@ -30,13 +30,10 @@ def words(filmed: Filmed, run: Path, *more: str) -> list[str]:
     return [*given, "--output", str(run), "--import.scale", "0.2", *more]
 
 
-def test_four_real_videos_become_a_scene(
-    pose2sim: Callable[[int], Filmed], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_four_real_videos_become_a_scene(pose2sim: Callable[[int], Filmed], tmp_path: Path, capsys, answered) -> None:
     run = tmp_path / "run"
     command = words(pose2sim(4), run, "--import.offsets", "none", "--import.frames", "0:3:3", "--hooks", "none")
-    assert main([*command, "--iterations", "20"]) == 0
-    said = capsys.readouterr().out
+    said = answered(*command, "--iterations", "20")
     assert "8 images of 4 cameras" in said
     metrics = json.loads((run / "metrics.json").read_text())
     assert metrics["test"] is None

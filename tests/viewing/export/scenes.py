@@ -82,11 +82,7 @@ def rasterized(
     with torch.no_grad():
         render = model.render(View(view.camera, 0, time, T_camera_world, K, finer * WIDTH, finer * HEIGHT))
     depth = render.depth_sum / render.alpha.clamp(min=1e-4)
-    return {
-        "color": render.color.clamp(0, 1).numpy(),
-        "depth": depth.numpy(),
-        "opacity": render.alpha.numpy(),
-    }
+    return {"color": render.color.clamp(0, 1).numpy(), "depth": depth.numpy(), "opacity": render.alpha.numpy()}
 
 
 def psnr(a: np.ndarray, b: np.ndarray) -> float:
