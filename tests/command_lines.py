@@ -1,7 +1,5 @@
 """Command lines that are refused, and the forms that read them."""
 
-from __future__ import annotations
-
 import re
 
 import pytest

@@ -1,7 +1,5 @@
 """Fixtures shared by all tests."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import zlib  # noqa: F401  before pycolmap, whose own copy of zlib would otherwise be bound

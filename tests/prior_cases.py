@@ -1,7 +1,5 @@
 """For tests of priors: sources that show something else, stores byte by byte, depth maps as COLMAP writes them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Recordings filmed again by cameras that start when they like: videos of a recording with known offsets and gains."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Raw parameters of Gaussians to slice, for the tests of the slice in torch and in the kernel."""
 
-from __future__ import annotations
-
 import math
 
 import torch

@@ -1,7 +1,5 @@
 """Kernels: compiled at first use, once, from a cache with nobody else's hands in it, or taken from a wheel."""
 
-from __future__ import annotations
-
 import ctypes
 import hashlib
 import json

@@ -1,7 +1,5 @@
 """Files that are kept: whole or not there, known again, and with one writer at a time."""
 
-from __future__ import annotations
-
 import errno
 import io
 import json

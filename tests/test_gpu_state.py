@@ -1,7 +1,5 @@
 """What `d2 doctor` tells a person with a GPU: each part that is missing, and what to do about it."""
 
-from __future__ import annotations
-
 import ctypes
 from types import SimpleNamespace
 

@@ -1,7 +1,5 @@
 """The three lines in a trainer: what they promise, the cap of Gaussians, and how a run that diverges ends."""
 
-from __future__ import annotations
-
 import copy
 import logging
 import math

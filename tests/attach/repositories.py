@@ -1,7 +1,5 @@
 """Every repository that has an adapter, as its mimic: how it is made, drawn, edited and saved."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Callable, Sequence
 from functools import partial

@@ -1,7 +1,5 @@
 """The traps of the official repositories, one by one: names, fields of view, batches, stages, probes, boxes."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The drop-in modules: the signatures of the Inria family, the numbers of this plugin's rasterizer."""
 
-from __future__ import annotations
-
 import logging
 import math
 

@@ -1,7 +1,5 @@
 """The rasterizers of SpacetimeGaussians and Ex4DGS, and torchvision, mmcv: what stands in for them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

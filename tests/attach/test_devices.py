@@ -1,7 +1,5 @@
 """Views and Gaussians on different devices, and Gaussians that no compiled kernel draws."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from fake_gpu import OnGpu, fake_gpu, move  # noqa: F401  a fixture

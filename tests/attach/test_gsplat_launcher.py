@@ -1,7 +1,5 @@
 """gsplat's simple_trainer through the launcher: its modules in small, a stand-in to draw, cameras told by pose."""
 
-from __future__ import annotations
-
 import importlib
 import sys
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Which camera and frame of the prior a trainer's camera object stands for."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import pytest

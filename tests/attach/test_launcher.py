@@ -1,7 +1,5 @@
 """The launcher: somebody else's train.py with D2 attached and no line of it edited."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """What a trainer imports and this environment lacks: found in its files, stood in for in memory, or asked for."""
 
-from __future__ import annotations
-
 import json
 import os
 import sys

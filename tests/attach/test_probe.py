@@ -1,7 +1,5 @@
 """Whether a trainer's own render may stand in for ours, alone and in a batch."""
 
-from __future__ import annotations
-
 import logging
 
 import pytest

@@ -1,7 +1,5 @@
 """`check_backbone` passes what keeps the contract and names, in a sentence, each way to break it."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import replace

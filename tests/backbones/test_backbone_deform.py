@@ -1,7 +1,5 @@
 """The bundled deformation backbone: its field, where it is still, how it learns, what is left out."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """The colour at infinity, and cameras of different exposure: begun with the images, learnt, saved with the model."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

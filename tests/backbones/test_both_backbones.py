@@ -1,7 +1,5 @@
 """What the plugin promises of every backbone: rows stay together through any edits, a resumed run is the same run."""
 
-from __future__ import annotations
-
 import io
 import math
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The proof on a GPU: what fits into the time that one is lent for, and what is said where there is none."""
 
-from __future__ import annotations
-
 import pytest
 
 from benchmarks.__main__ import PARTS

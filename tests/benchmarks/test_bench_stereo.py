@@ -1,7 +1,5 @@
 """`python -m benchmarks`: scores of stereo and priors are what they are called, maps are spoiled as said."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What holds for every part of `python -m benchmarks`: settings, help, where rows go, and the page of them all."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The rivals' losses are the published ones: golden values from numpy, gradients by differences, stiff maps."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

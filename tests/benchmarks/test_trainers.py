@@ -1,7 +1,5 @@
 """The bench of the official trainers: its table from rows, what it asks each script for, and one run of a mimic."""
 
-from __future__ import annotations
-
 import json
 import os
 import sys

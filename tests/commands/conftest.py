@@ -1,7 +1,5 @@
 """A recording small enough to train on in seconds."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """What the command line makes of mistakes, faults and Ctrl-C: one sentence, an exit code, no traceback."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,7 +1,5 @@
 """The `d2` command as a person uses it: from recording to score, the demo, and one sentence for every mistake."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Callable

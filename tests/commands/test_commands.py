@@ -1,7 +1,5 @@
 """Every `d2` command as a person meets it: its help, its flags, and tables given by flags."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """Command lines and configurations at random: an answer, or one sentence that is no fault of ours."""
 
-from __future__ import annotations
-
 import functools
 import importlib.metadata
 import os

@@ -1,7 +1,5 @@
 """The slice of a 4D Gaussian: golden vectors, the kernel against torch, and where numbers end."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from functools import partial

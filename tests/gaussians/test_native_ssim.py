@@ -1,7 +1,5 @@
 """The photometric loss and the background in the kernel are those in torch: value, gradient, borders, threads."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

@@ -1,7 +1,5 @@
 """Verified-depth supervision: the paper's loss, what sigma and far pixels add, by torch and by the kernel."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """What moves: the image halfway between two instants supervises it, and it lives as long as its instant."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """Priors in memory: for which camera, as they are stored, no more than the setting allows, read ahead in a thread."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable
 from dataclasses import replace

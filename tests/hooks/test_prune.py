@@ -1,7 +1,5 @@
 """Pruning: the paper's scores, written out, what standing in free space adds, and how much may go at once."""
 
-from __future__ import annotations
-
 import logging
 from dataclasses import replace
 from types import SimpleNamespace

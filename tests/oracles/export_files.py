@@ -1,7 +1,5 @@
 """Readers of what `d2 export` writes, as other programs read it: the oracles of its writers."""
 
-from __future__ import annotations
-
 import base64
 import gzip
 import json

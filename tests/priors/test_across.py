@@ -1,7 +1,5 @@
 """Slopes from surfaces that maps share: right where anchors cannot tell them, nothing where maps do not belong."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path

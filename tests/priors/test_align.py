@@ -1,7 +1,5 @@
 """Alignment of monocular depth: the line of least certified cost, what is refused, and stiff cases (43, 45)."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import example, given, settings

@@ -1,7 +1,5 @@
 """Scene flow and the instants halfway, in a recording of flat things whose truth halfway is drawn as well."""
 
-from __future__ import annotations
-
 import itertools
 from pathlib import Path
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """Building priors: what is verified is right, nothing is computed twice, and a kill loses the frame in work."""
 
-from __future__ import annotations
-
 import contextlib
 import importlib
 import importlib.util

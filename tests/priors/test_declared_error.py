@@ -1,7 +1,5 @@
 """Declared against true error: the table is computed right, and sigma holds on recordings with true depth."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Depth on disk: sensor maps, confidences and COLMAP workspaces become geometric depth in our units, or are refused."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

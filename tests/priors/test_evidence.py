@@ -1,7 +1,5 @@
 """Mono-only depth compared with other cameras: surfaces are taken, maps that meet agree, the rest stays as it is."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

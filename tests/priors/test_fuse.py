@@ -1,7 +1,5 @@
 """Fusion and the sky: which depth a pixel gets, with which label and sigma."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Geometric depth of one instant: cameras and ranges, how good it is, and where it is empty or refused (case 44)."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Every compiled kernel of the priors returns what its NumPy oracle does, for any number of threads."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Depth of all views from one network: read as its exporters write it, scaled, believed as far as evidence goes."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable
 from dataclasses import replace

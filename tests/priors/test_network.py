@@ -1,7 +1,5 @@
 """Monocular networks: sizes, preprocessing, what comes out, and what is refused."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable
 from dataclasses import replace

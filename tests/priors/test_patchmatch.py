@@ -1,7 +1,5 @@
 """PatchMatch: as good as was promised, the same on every machine and thread, and never a map out of nothing."""
 
-from __future__ import annotations
-
 import platform
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """PatchMatch on the GPU: the same .cu source on the CPU (fibre shim) and, where there is one, on a GPU."""
 
-from __future__ import annotations
-
 import ctypes
 import functools
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """The prior store: what comes out is what went in, damage is named, and it is whose it says."""
 
-from __future__ import annotations
-
 import json
 import math
 import shutil

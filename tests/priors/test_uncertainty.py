@@ -1,7 +1,5 @@
 """Monocular depth beyond its anchors: local correction, and the declared sigma, which holds or is infinite."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """NVRTC, its cache and the launcher: what happens to gpu.cu before it runs, without a GPU."""
 
-from __future__ import annotations
-
 import ctypes
 import warnings
 from collections.abc import Iterator

@@ -3,8 +3,6 @@
 The GPU's run on the CPU (`shim`: the same .cu source and host code) and, where there is one, on a device (`cuda`).
 """
 
-from __future__ import annotations
-
 import functools
 import os
 import warnings

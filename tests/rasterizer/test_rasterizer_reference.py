@@ -1,7 +1,5 @@
 """The torch rasterizer against the definition of splatting, its gradients, and space that must be free."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

@@ -1,7 +1,5 @@
 """Poses from what cameras saw of the same things: refined, found, scaled, and refused where that settles nothing."""
 
-from __future__ import annotations
-
 import zlib  # noqa: F401  (pycolmap brings a zlib of its own that must not come first)
 from collections.abc import Callable
 from dataclasses import replace

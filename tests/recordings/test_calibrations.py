@@ -1,7 +1,5 @@
 """Calibrations of other tools: what was written from known cameras comes back, distortion included."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

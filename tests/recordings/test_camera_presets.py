@@ -1,7 +1,5 @@
 """Cameras by the name of a preset or a published protocol: nested, sound, explained, and never made up."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What is looked at before work begins: calibrations that contradict the images, exposures, empty images, memory."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import combinations

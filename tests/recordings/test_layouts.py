@@ -1,7 +1,5 @@
 """Layouts are one table: a recording in each reads back, a reader or a writer is a function or two and one row."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Lens distortion undone on load: a recorded image becomes the one a pinhole camera would have taken."""
 
-from __future__ import annotations
-
 import json
 import math
 import pickle

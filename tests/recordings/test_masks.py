@@ -1,7 +1,5 @@
 """Masks beside images: what is foreground, and what was recorded at all."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A recording goes out in the layout of each public repository and comes back with the same cameras and images."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace

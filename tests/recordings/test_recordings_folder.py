@@ -1,7 +1,5 @@
 """The folder layout: what is read, what is refused and in which words."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

@@ -1,7 +1,5 @@
 """The N3DV layout: rows of poses_bounds.npy, videos and extracted frames."""
 
-from __future__ import annotations
-
 import pickle
 import shutil
 from pathlib import Path

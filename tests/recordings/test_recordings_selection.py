@@ -1,7 +1,5 @@
 """Fewer cameras, frames and pixels; images in and out of files."""
 
-from __future__ import annotations
-
 import struct
 import sys
 from pathlib import Path

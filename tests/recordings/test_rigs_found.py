@@ -1,7 +1,5 @@
 """Rigs whose lenses are not known, or whose cameras share a board alone; features in better places; d2 import."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """`d2 ablate`: the rows are the paper's, seeds are averaged, and a finished run is never repeated."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

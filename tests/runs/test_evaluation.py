@@ -1,7 +1,5 @@
 """Evaluation: the right means, honest depth errors, images that can be looked at."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """Metrics agree with the reference implementations they are named after."""
 
-from __future__ import annotations
-
 import doctest
 import importlib.util
 import logging

@@ -1,7 +1,5 @@
 """What a scene does not need is left out, with the measurement that says so."""
 
-from __future__ import annotations
-
 import shutil
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`d2 report`: made from rows and run folders alone, the same every time, and it says where its figures come from."""
 
-from __future__ import annotations
-
 import re
 import xml.etree.ElementTree as ET
 from pathlib import Path

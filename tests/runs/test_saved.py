@@ -1,7 +1,5 @@
 """What a run keeps: a damaged file is one sentence, a run that diverged stops, a second writer is refused."""
 
-from __future__ import annotations
-
 import io
 import math
 from pathlib import Path

@@ -1,7 +1,5 @@
 """From a recording to views, images and the points that Gaussians start from."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """`d2 bench training`: equal CPU time, rows as they finish, reruns of what lacks; workers end with their parent."""
 
-from __future__ import annotations
-
 import math
 import os
 import signal

@@ -1,7 +1,5 @@
 """Training cameras that are left out decide what of the prior is worth inserting."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Stiff cases 18 to 41 of depth and of a training step with hooks: empty masks, numbers that leave their range."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace

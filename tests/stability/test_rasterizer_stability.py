@@ -1,7 +1,5 @@
 """Stiff and extreme Gaussians, numbered as in the list of cases that broke other codebases, on every path."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -3,8 +3,6 @@
 Of what the plugin itself keeps a valid result is the one that was written.
 """
 
-from __future__ import annotations
-
 import json
 import random
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Doors that a hostile or unlucky user found: one sentence each, in bounded time, and nothing of theirs is touched."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 import os

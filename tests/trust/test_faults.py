@@ -1,7 +1,5 @@
 """A disk that fails, kill -9 at any moment, a day of runs on one store: the same command again ends as undisturbed."""
 
-from __future__ import annotations
-
 import errno
 import random
 import shutil

@@ -1,7 +1,5 @@
 """A trainer or a store of somebody's own that does something else than the contract says: named, never silent."""
 
-from __future__ import annotations
-
 import copy
 import logging
 import math

@@ -1,7 +1,5 @@
 """Checkpoints of official trainers are shown as their own code draws them, and none of that code is run."""
 
-from __future__ import annotations
-
 import pickle
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Camera paths: they begin and end where they say, look where the cameras look, and stay where the cameras saw."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Videos of a run: every image at its rate, along any path, of any kind, and nothing left where one fails."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Callable

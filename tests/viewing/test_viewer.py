@@ -1,7 +1,5 @@
 """The viewer without a browser: training stays bitwise what it is, images keep to their share, names stay names."""
 
-from __future__ import annotations
-
 import copy
 import math
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """The page in a real browser: it opens, a person moves camera and time, images change, two look at once."""
 
-from __future__ import annotations
-
 import socket
 import threading
 from collections.abc import Callable, Iterator

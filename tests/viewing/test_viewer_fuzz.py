@@ -1,7 +1,5 @@
 """The live viewer's socket, attacked: whatever a client sends, nothing is printed, others are served, nothing stops."""
 
-from __future__ import annotations
-
 import random
 from contextlib import closing, suppress
 from socket import SHUT_WR, create_connection

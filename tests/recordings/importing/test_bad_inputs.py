@@ -1,7 +1,5 @@
 """What people give by mistake: one sentence that says what to do, and nothing is written over."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

@@ -1,7 +1,5 @@
 """From videos to a recording: offsets, gains, turns and dropped frames are undone, and a stopped import goes on."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from fractions import Fraction
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Stand-ins for three recordings of public laboratories: webcams with a board, Xvid at wide angles, a mouse."""
 
-from __future__ import annotations
-
 import json
 import re
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """From real videos and their calibration to a trained scene with one command: pose2sim's four cameras."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

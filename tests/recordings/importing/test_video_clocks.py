@@ -1,7 +1,5 @@
 """When cameras started: timecode, sound, motion, each alone, and what happens where they contradict each other."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from fractions import Fraction

@@ -1,7 +1,5 @@
 """A video as its container describes it: time stamps, turn, timecode, and its frames in any order."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Small moving scenes for tests of exports, made from the bundled backbones without training them."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from tiny import make_adapter, make_model, make_views

@@ -1,7 +1,5 @@
 """`d2 export` as a person meets it: every mistake is one sentence, and what was written is said."""
 
-from __future__ import annotations
-
 import re
 import shutil
 from pathlib import Path

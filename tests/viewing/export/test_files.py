@@ -1,7 +1,5 @@
 """Every format read back: what a reader finds is what was trained, within what the format says it keeps."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import subprocess

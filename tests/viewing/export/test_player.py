@@ -1,7 +1,5 @@
 """The exported page in a real browser: offline, it plays, and what it shows is what our rasterizer draws."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Iterator
 from dataclasses import replace
