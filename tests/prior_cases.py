@@ -50,7 +50,6 @@ def plane_seen_by(camera: Camera, normal: Sequence[float], offset: float) -> np.
 
 
 def contents(path: Path) -> dict[str, bytes]:
-    """Every file below a folder."""
     return {str(file.relative_to(path)): file.read_bytes() for file in sorted(path.rglob("*")) if file.is_file()}
 
 

@@ -19,8 +19,6 @@ UNIT = Fraction(1, 12_800)
 
 @dataclass(frozen=True)
 class Shooting:
-    """How one camera filmed."""
-
     offset: float = 0.0
     """Seconds after the first instant of the recording at which its clock began."""
     gain: tuple[float, float, float] = (1.0, 1.0, 1.0)
@@ -50,7 +48,6 @@ class Filmed:
 
     @property
     def videos(self) -> Path:
-        """Where they lie."""
         return self.folder / "videos"
 
 

@@ -26,7 +26,6 @@ posix = pytest.mark.skipif(os.name == "nt", reason="owners and modes are those o
 
 @pytest.fixture(autouse=True)
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """An empty cache for every test."""
     monkeypatch.setenv("D2_CACHE", str(tmp_path / "cache"))
     return tmp_path / "cache"
 
@@ -45,7 +44,6 @@ def load(source: Path, **options: object) -> ctypes.CDLL:
 
 @pytest.fixture
 def builds(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """What is compiled during the test."""
     names, build = [], compiler._compile
 
     def counted(library: Path, *rest: object) -> ctypes.CDLL:
@@ -62,7 +60,6 @@ def forget() -> None:
 
 
 def script(path: Path, text: str) -> str:
-    """A program to name in CXX."""
     path.write_text(f"#!/bin/sh\n{text}\n")
     path.chmod(0o755)
     return str(path)

@@ -270,8 +270,6 @@ def test_a_backbone_without_trained_is_checked_through_its_slice() -> None:
     model = make_model()
 
     class Bare:
-        """Nothing optional."""
-
         slice_at = staticmethod(model.slice_at)
 
     bare: Any = Bare()

@@ -229,7 +229,6 @@ def run(name: str, source: ModuleType | None = None, **options: Any) -> SimpleNa
 
 
 def snapshot(outcome: SimpleNamespace) -> dict[str, Tensor]:
-    """Every parameter of a trained model."""
     model = vars(outcome).get("gaussians", vars(outcome).get("splats", vars(outcome).get("params")))
     named = model.named_parameters() if isinstance(model, torch.nn.Module) else vars(model).items()
     return {key: value.detach().clone() for key, value in named if isinstance(value, torch.nn.Parameter)}

@@ -132,7 +132,6 @@ def one_listener(adapter: WatchedModel) -> None:
 
 
 def early(adapter: WatchedModel) -> None:
-    """Reports before the change."""
     report, select = adapter._report, type(adapter.model).select
     adapter.model.select = lambda index: (report(index), select(adapter.model, index))
 

@@ -46,12 +46,7 @@ def test_parts_are_found_from_any_folder_and_a_mistake_is_one_sentence(
     ],
 )
 def test_a_part_adds_rows_of_what_it_measured_and_prints_their_tables(
-    words: str,
-    rows: int,
-    shown: str,
-    tmp_path: Path,
-    answered,
-    monkeypatch: pytest.MonkeyPatch,
+    words, rows, shown, tmp_path, answered, monkeypatch
 ) -> None:
     monkeypatch.setattr("torch.set_num_threads", lambda count: None)
     monkeypatch.setattr(scaling, "in_fresh_process", lambda work, *given: memory.Measured(work(*given), 1.0))

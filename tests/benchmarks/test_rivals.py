@@ -200,7 +200,6 @@ def folder_of(output: Path, method: str) -> Path:
 
 
 def run_of(output: Path, name: str) -> Run:
-    """The run of a rival."""
     stored = read_run(folder_of(output, name))
     rival = guidance(stored.pop("guidance")["name"], 24)
     return Run(RunSettings.from_table(stored, "run.json"), folder_of(output, name), rival)

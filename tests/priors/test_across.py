@@ -61,7 +61,6 @@ def shown(
 
 
 def anchored(view: Shown, geometric: np.ndarray) -> Shown:
-    """The view with other anchors."""
     geometric = geometric.astype(np.float32)
     alignment = align(view.mono, geometric, kind="relative", settings=ALIGN)
     return view._replace(geometric=geometric, alignment=alignment)

@@ -37,7 +37,6 @@ def ball(column: float, row: float, radius: float = RADIUS) -> np.ndarray:
 
 
 def shown(*balls: np.ndarray) -> np.ndarray:
-    """The wall with orange balls in front."""
     image = wall()
     for mask in balls:
         image[mask] = (240, 150, 20)

@@ -42,7 +42,6 @@ def left_of(left: FusedPrior, right: FusedPrior) -> FusedPrior:
 
 
 def painted(prior: FusedPrior, color: int) -> FusedPrior:
-    """With an image of one grey value."""
     return replace(prior, colors=np.full((HEIGHT, WIDTH, 3), color, np.uint8))
 
 

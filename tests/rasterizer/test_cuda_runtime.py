@@ -145,7 +145,6 @@ def test_a_launch_of_nothing_never_reaches_the_driver(shim_driver: ctypes.CDLL) 
 
 
 def empty_scene() -> tuple:
-    """Arguments of a frame without Gaussians."""
     means, covariances, opacities = torch.zeros(0, 3), torch.zeros(0, 6), torch.zeros(0)
     constants = [0.2, 0.3, 0.99, 1 / 255, 1e-4, 1.3, 0.0]
     return means, covariances, opacities, (torch.eye(4), torch.eye(3), 16, 16), constants, 0

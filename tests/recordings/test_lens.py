@@ -30,7 +30,6 @@ def texture(pixels: np.ndarray) -> np.ndarray:
 
 
 def centres() -> np.ndarray:
-    """Pixel centres [H, W, 2]."""
     return np.stack(np.meshgrid(np.arange(SIZE[0]) + 0.5, np.arange(SIZE[1]) + 0.5), axis=-1)
 
 

@@ -128,7 +128,6 @@ def test_leaving_depth_out_never_flatters(missing: float) -> None:
 
 @pytest.fixture(scope="module")
 def image() -> torch.Tensor:
-    """A smooth image between .2 and .8."""
     rows, columns = torch.meshgrid(torch.linspace(0, 6, 40), torch.linspace(0, 9, 50), indexing="ij")
     return 0.5 + 0.3 * torch.stack([torch.sin(columns), torch.cos(rows), torch.sin(rows + columns)], -1)
 

@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -170,12 +169,7 @@ def test_the_user_may_choose_and_then_nothing_is_tried(settings, tmp_path, tried
     ],
 )
 def test_parallax_is_left_out_where_another_depth_fills_what_stereo_leaves_empty(
-    settings: RunSettings,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    choice: str,
-    tables: dict[str, Any],
-    on: bool,
+    settings, tmp_path, monkeypatch, choice, tables, on
 ) -> None:
     run = run_of(replace(settings, overrides=tables), tmp_path / "run")
     run.trials = {"choice": choice}

@@ -46,7 +46,6 @@ class Store:
         self.change = change
 
     def prior(self, camera: str, frame: int) -> DepthPrior:
-        """The changed prior of any view."""
         exact = TinyStore().prior(camera, frame)
         depth, labels = self.change(exact.depth.clone(), exact.labels.clone())
         return DepthPrior(depth, labels, exact.colors)

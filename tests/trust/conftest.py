@@ -28,7 +28,6 @@ class Work:
     begin: Callable[[], None]
 
     def anew(self) -> None:
-        """As before the first command."""
         shutil.rmtree(self.folder)
         self.folder.mkdir()
         self.begin()

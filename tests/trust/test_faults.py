@@ -172,7 +172,6 @@ class Day:
         return [*self.place.work["priors"].words, "--train-cameras", cameras, "--output", str(self.store)]
 
     def live(self) -> None:
-        """Until every run is finished."""
         running: dict[Started, int] = {}
         while self.open or running:
             while len(running) < AT_ONCE and (self.open or not running):

@@ -40,5 +40,4 @@ def bare(room: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def viewed(trained: Path) -> ViewedRun:
-    """The same run, opened."""
     return viewed_run(trained)

@@ -74,7 +74,6 @@ def looker() -> Any:
 
 
 def built(viewed: ViewedRun, client: Any = None) -> Page:
-    """The page of a client, laid out."""
     page = Page(client or looker(), viewed, None, 54, lambda: None)
     page.build()
     return page

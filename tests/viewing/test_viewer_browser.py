@@ -51,7 +51,6 @@ def opened(new_page: Callable[[], Page], viewer: Viewer) -> Page:
 
 
 def image(page: Page) -> np.ndarray:
-    """What the page shows, [H, W, 3]."""
     return decoded(page.page.screenshot(clip=FREE)).astype(float)
 
 

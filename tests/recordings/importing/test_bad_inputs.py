@@ -57,7 +57,6 @@ def importing(given: Filmed, output: Path, *more: str) -> list[str]:
 
 
 def change(given: Filmed, edit: Callable[[dict[str, Any]], object]) -> None:
-    """Spoil the calibration."""
     table = json.loads(given.calibration.read_text())
     edit({camera["name"]: camera for camera in table["cameras"]})
     given.calibration.write_text(json.dumps(table))
@@ -107,7 +106,6 @@ def edited(edit: Callable[[dict[str, Any]], object]) -> Callable[[Filmed], None]
 
 
 def overwritten(name: str, content: bytes) -> Callable[[Filmed], object]:
-    """Writes something else into a file."""
     return lambda given: (given.folder / name).write_bytes(content)
 
 

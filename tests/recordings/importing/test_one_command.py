@@ -17,7 +17,6 @@ pytest.importorskip("cv2")
 
 @pytest.fixture
 def pose2sim(shared_data: Callable[[str], Path], tmp_path: Path) -> Callable[[int], Filmed]:
-    """Videos of its first frames."""
     recording = open_recording(shared_data("pose2sim_single"))
     shootings = {name: Shooting() for name in recording.cameras}
     return lambda frames: video(select_frames(recording, recording.frames[:frames]), tmp_path / "filmed", shootings)
