@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from mimics import gsplat
+from mimics.workplace import HOOKS
 from refusals import refuses
 from splat_scenes import random_scene
 from tiny import TinyStore, make_views
@@ -20,7 +21,6 @@ from d2_plugin.adapters.keys import ViewsByPose
 from d2_plugin.attach.gsplat import GsplatSession, put_in_place
 from d2_plugin.attach.recipes import recipe
 from d2_plugin.compat import gsplat as stand_in
-from d2_plugin.config import DensifyConfig, DepthLossConfig, PruneConfig
 from d2_plugin.protocol import RasterSettings
 from d2_plugin.rasterizer import reference
 from d2_plugin.recordings.export.colmap import test_every as every_nth
@@ -117,13 +117,6 @@ def trained(config: D2Config | None) -> tuple[dict[str, torch.Tensor], GsplatSes
         session.wrap()
     runner = importlib.import_module("simple_trainer").start()
     return {name: value.detach() for name, value in runner.splats.items()}, session
-
-
-HOOKS = D2Config(
-    densify=DensifyConfig(start=3, stop=30, every=5, budget_per_view=15),
-    prune=PruneConfig(start=5, stop=30, every=5, patience=2, tau_p=0.6),
-    depth_loss=DepthLossConfig(every=1, weight=0.2),
-)
 
 
 @pytest.mark.usefixtures("checkout")
