@@ -16,10 +16,7 @@ from d2_plugin import cache, compiler
 from d2_plugin.cache import Untrusted, cache_lock, check_private, is_trusted, private_cache
 from d2_plugin.compiler import CompileError, NoCompiler, cache_folder, find_compiler, load_library, prebuilt
 
-try:
-    find_compiler()
-except NoCompiler as error:
-    pytest.skip(str(error), allow_module_level=True)
+pytestmark = pytest.mark.usefixtures("compiler")
 
 posix = pytest.mark.skipif(os.name == "nt", reason="owners and modes are those of POSIX")
 

@@ -23,8 +23,6 @@ from d2_plugin.errors import D2Error
 from d2_plugin.hooks import Context, Hook, HookConfig
 from d2_plugin.hooks.prior import PriorLoader
 from d2_plugin.protocol import View
-from d2_plugin.recordings.export.folder import save_recording
-from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.runs.ablation.ablate import ablate
 from d2_plugin.runs.ablation.presets import PRESETS, rows_named
 from d2_plugin.runs.rows import read_rows
@@ -178,9 +176,8 @@ def test_hard_depth_draws_what_ends_fainter(backbone: str) -> None:
 
 
 @pytest.fixture(scope="module")
-def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    recording = synthetic_recording(cameras=2, held_out=1, frames=2, width=96, height=54)
-    return save_recording(recording, tmp_path_factory.mktemp("recordings") / "room")
+def room(saved_room: Callable[..., Path]) -> Path:
+    return saved_room(cameras=2, held_out=1, frames=2, width=96, height=54)
 
 
 @pytest.fixture(scope="module")

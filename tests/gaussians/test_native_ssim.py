@@ -14,13 +14,8 @@ from d2_plugin.gaussians import native_ssim as kernel
 from d2_plugin.gaussians.photometric import photometric_loss, reference_photometric_loss
 from d2_plugin.protocol import Render, View
 
+pytestmark = pytest.mark.usefixtures("compiler")
 SIZES = [(1, 1), (1, 40), (40, 1), (11, 11), (37, 23), (150, 160)]
-
-
-@pytest.fixture(autouse=True)
-def compiled() -> None:
-    if kernel.library() is None:
-        pytest.skip("there is no C++ compiler")
 
 
 def images(height: int, width: int, channels: int = 3, seed: int = 0, noise: float = 0.1) -> tuple[Tensor, Tensor]:

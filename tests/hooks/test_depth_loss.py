@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from d2_plugin.hooks import depth_loss as module
-from d2_plugin.hooks import native_depth_loss
 from d2_plugin.hooks import prior as loading
 from d2_plugin.hooks.densify import Densify, DensifyConfig, rendered_depth, under_reconstructed
 from d2_plugin.hooks.depth_loss import DepthLossConfig, supervision
@@ -88,13 +87,7 @@ class TestRender:
         torch.testing.assert_close(by_alpha.float(), torch.where(near, -DepthLossConfig().opaque / near.sum(), 0.0))
 
 
-@pytest.fixture
-def compiled() -> None:
-    if native_depth_loss.library() is None:
-        pytest.skip("there is no C++ compiler")
-
-
-@pytest.mark.usefixtures("compiled")
+@pytest.mark.usefixtures("compiler")
 class TestKernel:
     @pytest.mark.parametrize("size", [(1, 1), (1, 17), (3, 5), (61, 67), (90, 130)])
     @pytest.mark.parametrize("paper", [False, True])

@@ -10,7 +10,6 @@ from prior_cases import camera_at
 from refusals import refuses
 
 from benchmarks.stereo_rigs import textured_rig
-from d2_plugin.compiler import NoCompiler, find_compiler
 from d2_plugin.priors.geometry import check_depth_range, check_views, pixel_grid, view_pair, viewing_rays
 from d2_plugin.priors.settings import StereoSettings
 from d2_plugin.priors.stereo.depth_range import depth_bounds
@@ -20,10 +19,7 @@ from d2_plugin.recordings.recording import Camera, Recording
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 
 pytest.importorskip("cv2")
-try:
-    find_compiler()
-except NoCompiler:
-    pytest.skip("there is no C++ compiler for patchmatch", allow_module_level=True)
+pytestmark = pytest.mark.usefixtures("compiler")
 
 
 SETTINGS = StereoSettings(matcher="patchmatch")

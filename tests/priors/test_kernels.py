@@ -12,7 +12,7 @@ from oracles import cross_view as cross_view_oracle
 from oracles import stereo_filter as oracle
 from prior_cases import camera_at, plane_seen_by
 
-from d2_plugin.compiler import NoCompiler, find_compiler
+from d2_plugin.compiler import NoCompiler
 from d2_plugin.errors import D2Error
 from d2_plugin.priors import build
 from d2_plugin.priors.evidence import with_evidence
@@ -27,10 +27,7 @@ from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.store.maps import FusedPrior
 
 pytest.importorskip("cv2")
-try:
-    find_compiler()
-except NoCompiler as error:
-    pytest.skip(str(error), allow_module_level=True)
+pytestmark = pytest.mark.usefixtures("compiler")
 
 SETTINGS = StereoSettings()
 TOLERANCE = 0.02

@@ -10,7 +10,6 @@ from prior_cases import camera_at
 
 from benchmarks.stereo_measure import measure
 from benchmarks.stereo_rigs import Rig, load_rigs, textured_rig
-from d2_plugin.compiler import NoCompiler, find_compiler
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.geometry import scaled_camera
 from d2_plugin.priors.settings import StereoSettings
@@ -21,10 +20,7 @@ from d2_plugin.priors.stereo.source_views import choose_sources
 from d2_plugin.recordings.recording import Camera
 
 pytest.importorskip("cv2")
-try:
-    find_compiler()
-except NoCompiler:
-    pytest.skip("there is no C++ compiler", allow_module_level=True)
+pytestmark = pytest.mark.usefixtures("compiler")
 
 SETTINGS = StereoSettings()
 

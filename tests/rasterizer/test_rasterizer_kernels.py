@@ -27,15 +27,11 @@ from splat_scenes import (
     use_shim,
 )
 
-from d2_plugin.compiler import NoCompiler, find_compiler
 from d2_plugin.errors import D2Error
 from d2_plugin.protocol import Label
 from d2_plugin.rasterizer import RasterSettings, Render, Splats, cuda, native, rasterize, reference, survey
 
-try:
-    find_compiler()
-except NoCompiler as error:
-    pytest.skip(str(error), allow_module_level=True)
+pytestmark = pytest.mark.usefixtures("compiler")
 
 NAMES = ("means", "covariances", "opacities", "colors", "background", "screen_offsets")
 REFERENCE = Path(torch.float64)

@@ -2,6 +2,7 @@
 
 import io
 import math
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -18,8 +19,6 @@ from d2_plugin.durable import write_archive, write_table
 from d2_plugin.errors import D2Error
 from d2_plugin.hooks.finite import Diverged
 from d2_plugin.locks import only_writer
-from d2_plugin.recordings.export.folder import save_recording
-from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.runs import run as run_module
 from d2_plugin.runs.evaluation import renderer
 from d2_plugin.runs.run import Run
@@ -31,9 +30,8 @@ pytest.importorskip("cv2")
 
 
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    recording = synthetic_recording(cameras=2, frames=2, width=48, height=27)
-    return save_recording(recording, tmp_path_factory.mktemp("scene") / "room")
+def scene(saved_room: Callable[..., Path]) -> Path:
+    return saved_room(cameras=2, frames=2, width=48, height=27)
 
 
 def bare(scene: Path, folder: Path, **changes: Any) -> Run:

@@ -1,5 +1,6 @@
 """Training cameras that are left out decide what of the prior is worth inserting."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,8 +14,6 @@ from d2_plugin.hooks.prior import PriorLoader, believed
 from d2_plugin.priors.summary import PriorSummary
 from d2_plugin.protocol import DepthPrior, Label
 from d2_plugin.recordings import Recording, open_recording
-from d2_plugin.recordings.export.folder import save_recording
-from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.runs.plan import Decision
 from d2_plugin.runs.prior.trials import Score, Trials, can_decide, leave_out_in_turn, left_out, small_prior
 from d2_plugin.runs.run import Run
@@ -81,9 +80,8 @@ def test_however_many_cameras_there_are_two_are_left_out_so_that_trials_cost_the
 
 
 @pytest.fixture(scope="module")
-def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    recording = synthetic_recording(cameras=3, held_out=0, frames=2, width=WIDTH, height=HEIGHT)
-    return save_recording(recording, tmp_path_factory.mktemp("scene") / "room")
+def room(saved_room: Callable[..., Path]) -> Path:
+    return saved_room(cameras=3, held_out=0, frames=2, width=WIDTH, height=HEIGHT)
 
 
 def stored(folder: Path, recording: Recording, wrong: float) -> Path:
