@@ -1,7 +1,5 @@
 """Runs of a comparison in this process: a worker of its own imports torch for seven seconds before it trains."""
 
-from __future__ import annotations
-
 import pickle
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future

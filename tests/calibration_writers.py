@@ -4,8 +4,6 @@ Everything goes by way of OpenCV's conventions: pixels whose centres lie at whol
 `cv2.Rodrigues`, projections of `cv2.projectPoints`. Numbers are written with all their digits.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Command lines that are refused, and the forms that read them."""
 
-from __future__ import annotations
-
 import re
 
 import pytest
@@ -15,11 +13,18 @@ def refused(capsys: pytest.CaptureFixture[str], *words: object) -> str:
     capsys.readouterr()
     assert main([str(word) for word in words]) == 2
     said = capsys.readouterr().err.splitlines()
-    lines = [line for line in said if not re.match(r"\[|\w+: \d+/\d+, ", line)]  # neither ffmpeg's own nor progress
+    lines = [line for line in said if not re.match(r"\[|[\w ]+: \d+/\d+, ", line)]  # neither ffmpeg's own nor progress
     assert len(lines) == 1, lines
     assert lines[0].startswith("d2: "), lines
     assert "unexpected" not in lines[0], lines
     return lines[0]
+
+
+def answered(capsys: pytest.CaptureFixture[str], *words: object) -> str:
+    """What a command line that does its work prints."""
+    capsys.readouterr()
+    assert main([str(word) for word in words]) == 0
+    return capsys.readouterr().out
 
 
 def form_of(command: str, words: list[str]) -> Form:

@@ -1,12 +1,10 @@
 """Fixtures shared by all tests."""
 
-from __future__ import annotations
-
 import contextlib
+import functools
 import os
 import zlib  # noqa: F401  before pycolmap, whose own copy of zlib would otherwise be bound
 from collections.abc import Callable, Iterator
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -43,12 +41,45 @@ def shared_data() -> Callable[[str], Path]:
     return locate
 
 
+@pytest.fixture(scope="session")
+def saved_room(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
+    """The folder of a rendered recording with these settings, written once, to be read only."""
+    pytest.importorskip("cv2", reason="opencv is in the `image` extra")
+    from d2_plugin.recordings.export.folder import save_recording
+    from d2_plugin.recordings.synthetic.room import synthetic_recording
+
+    @functools.cache
+    def write(**chosen: float) -> Path:
+        return save_recording(synthetic_recording(**chosen), tmp_path_factory.mktemp("recording") / "room")
+
+    return write
+
+
 @pytest.fixture
 def refused(capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
     """The sentence with which a command line is refused."""
     import command_lines  # after the environment is set above
 
-    return partial(command_lines.refused, capsys)
+    return functools.partial(command_lines.refused, capsys)
+
+
+@pytest.fixture
+def answered(capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
+    """What a command line that does its work prints."""
+    import command_lines  # after the environment is set above
+
+    return functools.partial(command_lines.answered, capsys)
+
+
+@pytest.fixture(scope="session")
+def compiler() -> None:
+    """Skips the test, by name, where there is no C++ compiler."""
+    from d2_plugin.compiler import NoCompiler, find_compiler
+
+    try:
+        find_compiler()
+    except NoCompiler as error:
+        pytest.skip(str(error))
 
 
 @pytest.fixture

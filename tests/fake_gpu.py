@@ -54,7 +54,6 @@ class OnGpu(Tensor):
         return self.held.data_ptr()
 
     def tolist(self) -> Any:
-        """One copy to the host."""
         _mode().wait("tolist", self.held)
         return self.held.tolist()
 
@@ -105,7 +104,6 @@ class FakeGpu(TorchDispatchMode):
         self.where: Counter[str] = Counter()
 
     def wait(self, name: str, copied: Tensor | None = None) -> None:
-        """The host waits."""
         self.waits[name] += 1
         self.where[f"{name} in {_caller()}"] += 1
         if copied is not None:
@@ -167,7 +165,6 @@ class FakeGpu(TorchDispatchMode):
 
     @contextmanager
     def counting(self) -> Iterator[FakeGpu]:
-        """Start from zero."""
         self.waits.clear()
         self.copied.clear()
         self.where.clear()

@@ -1,7 +1,5 @@
 """Mutations of valid files, drawn from a seed: what is wrong about them is that nobody wrote them so."""
 
-from __future__ import annotations
-
 import json
 import os
 import random

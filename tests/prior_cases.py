@@ -1,7 +1,5 @@
 """For tests of priors: sources that show something else, stores byte by byte, depth maps as COLMAP writes them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -52,7 +50,6 @@ def plane_seen_by(camera: Camera, normal: Sequence[float], offset: float) -> np.
 
 
 def contents(path: Path) -> dict[str, bytes]:
-    """Every file below a folder."""
     return {str(file.relative_to(path)): file.read_bytes() for file in sorted(path.rglob("*")) if file.is_file()}
 
 

@@ -1,7 +1,5 @@
 """What the rasterizers of the Inria family are called with, for a small scene."""
 
-from __future__ import annotations
-
 import torch
 from splat_scenes import random_scene
 from torch import Tensor

@@ -1,7 +1,5 @@
 """Recordings filmed again by cameras that start when they like: videos of a recording with known offsets and gains."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -21,8 +19,6 @@ UNIT = Fraction(1, 12_800)
 
 @dataclass(frozen=True)
 class Shooting:
-    """How one camera filmed."""
-
     offset: float = 0.0
     """Seconds after the first instant of the recording at which its clock began."""
     gain: tuple[float, float, float] = (1.0, 1.0, 1.0)
@@ -52,7 +48,6 @@ class Filmed:
 
     @property
     def videos(self) -> Path:
-        """Where they lie."""
         return self.folder / "videos"
 
 

@@ -1,7 +1,5 @@
 """Made-up rigs for tests of calibration: what their cameras see of random things, and boards that they video."""
 
-from __future__ import annotations
-
 import zlib  # noqa: F401  (pycolmap brings a zlib of its own that must not come first)
 from dataclasses import replace
 

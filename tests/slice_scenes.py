@@ -1,7 +1,5 @@
 """Raw parameters of Gaussians to slice, for the tests of the slice in torch and in the kernel."""
 
-from __future__ import annotations
-
 import math
 
 import torch
@@ -48,6 +46,5 @@ def random_rows(count: int, temporal: bool, seed: int = 0, time_scale: float = 0
 
 
 def relative_error(value: Tensor, expected: Tensor) -> float:
-    """Relative L2 distance."""
     difference = torch.linalg.vector_norm(value.double() - expected)
     return float(difference / torch.linalg.vector_norm(expected).clamp(min=1e-300))

@@ -1,7 +1,5 @@
 """The same small recording in every layout that can be read, for tests that damage it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Small recordings that tests write themselves, in the form of the recordings that are not part of the project."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """kornia as a yardstick: our lenses, colours and similarity against the field's library, where both define the same."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

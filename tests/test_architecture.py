@@ -1,7 +1,5 @@
 """The house: a room for every idea and imports that run one way, and all of it is packaged and documented."""
 
-from __future__ import annotations
-
 import ast
 import configparser
 import functools

@@ -1,7 +1,5 @@
 """Kernels: compiled at first use, once, from a cache with nobody else's hands in it, or taken from a wheel."""
 
-from __future__ import annotations
-
 import ctypes
 import hashlib
 import json
@@ -12,23 +10,19 @@ import sys
 from pathlib import Path
 
 import pytest
+from refusals import refuses
 
 from d2_plugin import cache, compiler
 from d2_plugin.cache import Untrusted, cache_lock, check_private, is_trusted, private_cache
 from d2_plugin.compiler import CompileError, NoCompiler, cache_folder, find_compiler, load_library, prebuilt
-from d2_plugin.errors import D2Error
 
-try:
-    find_compiler()
-except NoCompiler as error:
-    pytest.skip(str(error), allow_module_level=True)
+pytestmark = pytest.mark.usefixtures("compiler")
 
 posix = pytest.mark.skipif(os.name == "nt", reason="owners and modes are those of POSIX")
 
 
 @pytest.fixture(autouse=True)
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """An empty cache for every test."""
     monkeypatch.setenv("D2_CACHE", str(tmp_path / "cache"))
     return tmp_path / "cache"
 
@@ -47,7 +41,6 @@ def load(source: Path, **options: object) -> ctypes.CDLL:
 
 @pytest.fixture
 def builds(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """What is compiled during the test."""
     names, build = [], compiler._compile
 
     def counted(library: Path, *rest: object) -> ctypes.CDLL:
@@ -64,7 +57,6 @@ def forget() -> None:
 
 
 def script(path: Path, text: str) -> str:
-    """A program to name in CXX."""
     path.write_text(f"#!/bin/sh\n{text}\n")
     path.chmod(0o755)
     return str(path)
@@ -116,19 +108,16 @@ class TestBuilding:
         self, source, monkeypatch, tmp_path
     ) -> None:
         monkeypatch.setenv("CXX", "no-such-compiler")
-        with pytest.raises(NoCompiler, match="CXX names 'no-such-compiler'"):
-            load(source)
+        refuses("CXX names 'no-such-compiler'", load, source, error=NoCompiler)
         old = script(tmp_path / "old", "echo \"unrecognized command line option '-std=c++17'\" >&2\nexit 1")
         monkeypatch.setenv("CXX", old)
-        with pytest.raises(NoCompiler, match=r"does not compile C\+\+17"):
-            load(source)
+        refuses(r"does not compile C\+\+17", load, source, error=NoCompiler)
         monkeypatch.setenv("CXX", script(tmp_path / "silent", "exit 0"))
         with pytest.raises(CompileError, match="without an error and without a library"):
             load(source)
         monkeypatch.delenv("CXX")
         monkeypatch.setenv("PATH", "")
-        with pytest.raises(NoCompiler, match=r"install g\+\+ or clang\+\+"):
-            load(source)
+        refuses(r"install g\+\+ or clang\+\+", load, source, error=NoCompiler)
 
     def test_cxx_may_carry_arguments(self, source, monkeypatch) -> None:
         monkeypatch.setenv("CXX", f"{find_compiler()[0]} -DEXTRA")
@@ -138,8 +127,7 @@ class TestBuilding:
     @pytest.mark.parametrize("variable", ["CXX", "D2_CXXFLAGS"])
     def test_an_open_quote_is_one_sentence(self, source, monkeypatch, variable: str) -> None:
         monkeypatch.setenv(variable, 'g++ "-O2')
-        with pytest.raises(D2Error, match=f"{variable} is .*, which no shell reads .*: correct or unset it"):
-            load(source)
+        refuses(f"{variable} is .*, which no shell reads .*: correct or unset it", load, source)
 
     def test_processes_that_start_together_all_get_the_library(self, source, folder) -> None:
         # compiler.py alone needs no torch; loading it as a module of a bare package keeps the starts quick.
@@ -165,8 +153,7 @@ class TestCache:
         assert cache_folder() == folder
         (tmp_path / "file").write_text("not a folder")
         monkeypatch.setenv("D2_CACHE", str(tmp_path / "file" / "cache"))
-        with pytest.raises(D2Error, match="set D2_CACHE to a writable folder"):
-            load(source)
+        refuses("set D2_CACHE to a writable folder", load, source)
         monkeypatch.delenv("D2_CACHE")
         monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
         assert cache_folder() == tmp_path / "d2-4dgs"
@@ -187,8 +174,7 @@ class TestCache:
     def test_one_below_a_folder_that_others_may_write_needs_one_where_only_owners_rename(self, folder: Path) -> None:
         folder.mkdir(mode=0o700)
         folder.parent.chmod(0o777)
-        with pytest.raises(Untrusted, match=f"others may write {folder.parent}"):
-            check_private(folder)
+        refuses(f"others may write {folder.parent}", check_private, folder, error=Untrusted)
         folder.parent.chmod(0o1777)
         check_private(folder)
 
@@ -197,8 +183,7 @@ class TestCache:
         monkeypatch.setattr(cache.os, "geteuid", lambda: 4711)
         if os.getuid() == 0:
             os.chown(folder, 1234, 1234)
-        with pytest.raises(Untrusted, match="belongs to another user"):
-            check_private(folder)
+        refuses("belongs to another user", check_private, folder, error=Untrusted)
 
     def test_a_group_that_is_the_user_alone_is_nobody_else(self, folder, monkeypatch) -> None:
         folder.mkdir()
@@ -215,8 +200,7 @@ class TestCache:
         (library,) = folder.glob("*.so")
         forget()
         folder.chmod(0o777)
-        with pytest.raises(Untrusted, match="could replace compiled code"):
-            load(source)
+        refuses("could replace compiled code", load, source, error=Untrusted)
         folder.chmod(0o700)
         library.unlink()  # written over, it would end this process, which has it loaded
         library.write_bytes(b"evil")
@@ -244,8 +228,7 @@ class TestCache:
             path.unlink()
         forget()
         lock.symlink_to(tmp_path / "precious")
-        with pytest.raises(Untrusted, match="is no plain file"):
-            load(source)
+        refuses("is no plain file", load, source, error=Untrusted)
         assert (tmp_path / "precious").read_text() == "do not truncate me"
         os.mkfifo(tmp_path / "pipe")
         with pytest.raises(Untrusted, match="is no plain file"), cache_lock(tmp_path / "pipe"):
@@ -299,8 +282,7 @@ class TestPrebuilt:
         monkeypatch.setenv("D2_CPU", "avx2")
         assert self.answer(source, monkeypatch, "avx512") == 1
         monkeypatch.setenv("D2_CPU", "sse9")
-        with pytest.raises(D2Error, match=r"sse9.*avx2, avx512, scalar"):
-            self.answer(source, monkeypatch, "avx512")
+        refuses(r"sse9.*avx2, avx512, scalar", self.answer, source, monkeypatch, "avx512")
 
     @pytest.mark.parametrize("change", [{}, {"flags": ["-DX"]}, {"name": "other"}], ids=["source", "flags", "name"])
     def test_a_library_of_another_version_is_never_taken(self, source, monkeypatch, change: dict) -> None:

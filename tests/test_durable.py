@@ -1,7 +1,5 @@
 """Files that are kept: whole or not there, known again, and with one writer at a time."""
 
-from __future__ import annotations
-
 import errno
 import io
 import json
@@ -19,6 +17,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from refusals import refuses
 
 from d2_plugin import durable
 from d2_plugin.durable import (
@@ -71,8 +70,7 @@ def test_what_is_no_table_is_one_sentence(tmp_path: Path, content: bytes) -> Non
 def test_a_folder_or_a_pipe_in_the_place_of_a_file_is_one_sentence(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     for path in (tmp_path, tmp_path / "pipe"):
-        with pytest.raises(Damaged, match="it is no plain file"):
-            read_table(path, KIND)
+        refuses("it is no plain file", read_table, path, KIND, error=Damaged)
 
 
 def test_another_version_is_named_before_anything_else(tmp_path: Path) -> None:
@@ -83,9 +81,7 @@ def test_another_version_is_named_before_anything_else(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["write", "fsync", "replace"])
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EIO, errno.EACCES])
-def test_a_write_that_fails_changes_nothing_and_leaves_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, number: int
-) -> None:
+def test_a_write_that_fails_changes_nothing_and_leaves_nothing(tmp_path, monkeypatch, name: str, number: int) -> None:
     write(tmp_path / "kept", b"before")
 
     def fail(*_: object) -> None:
@@ -102,8 +98,7 @@ def test_a_write_that_fails_changes_nothing_and_leaves_nothing(
 def test_a_file_where_a_folder_belongs_and_a_folder_where_a_file_belongs(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     for path in (tmp_path / "file" / "below", tmp_path, tmp_path / ("x" * 300)):
-        with pytest.raises(CannotWrite, match="cannot write|is a file, expected a folder"):
-            write(path, b"content")
+        refuses("cannot write|is a file, expected a folder", write, path, b"content", error=CannotWrite)
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
@@ -123,9 +118,7 @@ def test_what_killed_writers_left_is_removed_and_nothing_else(tmp_path: Path) ->
     assert {path.name for path in tmp_path.rglob("*")} == {"below", "part", ".hidden", "a.part"}
 
 
-def test_lines_are_added_whole_and_a_line_that_was_cut_off_stays_alone(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_lines_are_added_whole_and_a_line_that_was_cut_off_stays_alone(tmp_path: Path, monkeypatch) -> None:
     path = tmp_path / "rows.jsonl"
     append(path, "1\n2\n")
     path.write_text("1\n2\n3")

@@ -1,7 +1,5 @@
 """What `d2 doctor` tells a person with a GPU: each part that is missing, and what to do about it."""
 
-from __future__ import annotations
-
 import ctypes
 from types import SimpleNamespace
 
@@ -77,9 +75,7 @@ HAS = {
     ],
     ids=["nothing", "NVRTC", "a newer driver", "a driver", "a torch with CUDA"],
 )
-def test_what_a_machine_lacks_is_named_with_what_to_do(
-    lacks: dict, says: dict[str, str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_a_machine_lacks_is_named_with_what_to_do(lacks: dict, says: dict[str, str], monkeypatch) -> None:
     report = machine(monkeypatch, **lacks)
     assert all(sentence in report[part] for part, sentence in says.items())
     assert report == HAS or lacks

@@ -1,7 +1,5 @@
 """What the package says of itself is true: one version everywhere, extras that exist, an import that loads little."""
 
-from __future__ import annotations
-
 import configparser
 import re
 import tomllib

@@ -1,7 +1,5 @@
 """The three lines in a trainer: what they promise, the cap of Gaussians, and how a run that diverges ends."""
 
-from __future__ import annotations
-
 import copy
 import logging
 import math
@@ -13,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from refusals import refuses
 from tiny import ALL_HOOKS, BACKBONES, TinyStore, make_adapter, make_model, make_trainer, make_views
 
 from d2_plugin import D2Error, D2Hooks
@@ -117,8 +116,7 @@ def test_a_hook_without_a_prior_says_what_to_set() -> None:
 def test_a_prior_of_another_size_is_refused_with_both_values() -> None:
     view = replace(make_views()[0], width=64)
     d2 = D2Hooks(only("depth_loss"), Yang4DAdapter(make_model()), TinyStore())
-    with pytest.raises(D2Error, match="is 32x24 pixels but the view is 64x24"):
-        d2.loss(1, view)
+    refuses("is 32x24 pixels but the view is 64x24", d2.loss, 1, view)
 
 
 class TestRetirement:
@@ -221,14 +219,12 @@ def test_training_stops_at_the_next_look_with_the_parameter(value: float) -> Non
     told = (
         r"at step 12 or less than 6 steps before it \(.* of \S+ is NaN or infinite.*\): no state was saved yet; lower"
     )
-    with pytest.raises(Diverged, match=told):
-        trainer.run(20, poisoned(trainer, 7, "positions", value))
+    refuses(told, trainer.run, 20, poisoned(trainer, 7, "positions", value), error=Diverged)
 
 
 def test_it_is_looked_before_anything_is_inserted_or_removed() -> None:
     trainer = make_trainer(replace(ALL_HOOKS, finite_every=1000))
-    with pytest.raises(Diverged, match=r"at step 5 or"):
-        trainer.run(20, poisoned(trainer, 3))
+    refuses(r"at step 5 or", trainer.run, 20, poisoned(trainer, 3), error=Diverged)
 
 
 def test_the_last_saved_step_is_told_and_a_spoilt_state_is_not_saved() -> None:
@@ -236,19 +232,16 @@ def test_the_last_saved_step_is_told_and_a_spoilt_state_is_not_saved() -> None:
     trainer.run(4)
     state = copy.deepcopy(trainer.state_dict())
     trainer.run(8, poisoned(trainer, 8))
-    with pytest.raises(Diverged, match=r"at step 8 .* the last state that was saved is of step 4"):
-        trainer.state_dict()
+    refuses(r"at step 8 .* the last state that was saved is of step 4", trainer.state_dict, error=Diverged)
     trainer = make_trainer(QUIET)
     trainer.load_state_dict(state)
-    with pytest.raises(Diverged, match=r"the last state that was saved is of step 4"):
-        trainer.run(20, poisoned(trainer, 7))
+    refuses(r"the last state that was saved is of step 4", trainer.run, 20, poisoned(trainer, 7), error=Diverged)
 
 
 def test_a_loss_of_d2_that_is_not_finite_is_reported() -> None:
     check = FiniteCheck(make_adapter(make_model()), 1)
     check.remember(torch.tensor(math.nan), [])
-    with pytest.raises(Diverged, match=r"\(D2's loss is nan\)"):
-        check.check(3, now=False)
+    refuses(r"\(D2's loss is nan\)", check.check, 3, now=False, error=Diverged)
 
 
 def test_it_can_be_switched_off() -> None:
@@ -268,8 +261,7 @@ def test_every_tensor_that_is_trained_is_checked(backbone: str) -> None:
     for name, value in trained.items():
         kept = value.detach().clone()
         value.data.view(-1)[-1] = math.inf
-        with pytest.raises(Diverged, match=name.replace(".", r"\.")):
-            check.check(1, now=False)
+        refuses(name.replace(".", r"\."), check.check, 1, now=False, error=Diverged)
         value.data.copy_(kept)
     check.check(1, now=False)
 
@@ -278,8 +270,6 @@ def test_a_backbone_without_trained_is_checked_through_its_slice() -> None:
     model = make_model()
 
     class Bare:
-        """Nothing optional."""
-
         slice_at = staticmethod(model.slice_at)
 
     bare: Any = Bare()
@@ -290,5 +280,4 @@ def test_a_backbone_without_trained_is_checked_through_its_slice() -> None:
     model.gaussians["base_colors"].data.fill_(math.nan)
     check.check(3, now=False)  # what it does not tell cannot be seen
     model.gaussians["opacity_logits"].data.fill_(math.nan)
-    with pytest.raises(Diverged, match="of opacities is NaN"):
-        check.check(4, now=False)
+    refuses("of opacities is NaN", check.check, 4, now=False, error=Diverged)

@@ -1,7 +1,5 @@
 """Files that somebody else wrote: a valid content comes out, or one sentence."""
 
-from __future__ import annotations
-
 import os
 import zipfile
 from pathlib import Path

@@ -17,6 +17,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from refusals import refuses
 from tiny import ALL_HOOKS
 
 import d2_plugin
@@ -116,8 +117,7 @@ def test_any_value_is_refused_in_one_sentence_with_its_name_or_kept_and_python_i
         assert f"run.{name}" in sentence
         assert "\n" not in sentence
         if not isinstance(value, dict):  # which only files have in the place of settings
-            with pytest.raises(D2Error, match=rf"Example\.{name}"):
-                Example(**{name: value})
+            refuses(rf"Example\.{name}", Example, **{name: value})
         return
     kept = getattr(made, name)
     assert Example(**{name: kept}) == made
@@ -156,8 +156,7 @@ def test_whole_numbers_become_floats_and_lists_tuples() -> None:
     ],
 )
 def test_a_mistake_is_told_with_what_was_expected_and_what_to_do(table: dict[str, Any], sentence: str) -> None:
-    with pytest.raises(D2Error, match=sentence):
-        Example.from_dict(table, "run")
+    refuses(sentence, Example.from_dict, table, "run")
 
 
 def test_a_setting_without_a_default_is_asked_for() -> None:
@@ -166,8 +165,7 @@ def test_a_setting_without_a_default_is_asked_for() -> None:
         name: str
         count: Count = 0
 
-    with pytest.raises(D2Error, match="recording must have name: add what is missing"):
-        Needy.from_dict({"count": 1}, "recording")
+    refuses("recording must have name: add what is missing", Needy.from_dict, {"count": 1}, "recording")
     assert declared(Needy)[0].default is MISSING
 
 
@@ -213,8 +211,7 @@ def test_every_number_among_the_settings_is_one_and_has_both_bounds_and_every_de
                 plain[setting.name] = setting.default
             if type(setting.default) in (int, float):
                 for wrong in ("much", [1], True):
-                    with pytest.raises(D2Error, match=setting.name):
-                        kind.from_dict({setting.name: wrong})
+                    refuses(setting.name, kind.from_dict, {setting.name: wrong})
         if all(setting.default is not MISSING for setting in declared(kind)):
             assert kind.from_dict(plain) == kind()
 
@@ -268,15 +265,13 @@ def test_a_file_says_its_version_and_paths_are_its_folders(tmp_path: Path) -> No
     path.write_text(text.replace("version = 1", ""))
     assert D2Config.from_toml(path) == ALL_HOOKS
     path.write_text(text.replace("version = 1", "version = 7"))
-    with pytest.raises(D2Error, match=r"d2\.toml has settings of version 7, and this d2-4dgs reads version 1: use the"):
-        D2Config.from_toml(path)
+    refuses(r"d2\.toml has settings of version 7, and this d2-4dgs reads version 1: use the", D2Config.from_toml, path)
     path.write_text('prior = "maps"\n[densify]\n')
     assert D2Config.from_toml(path).prior == str(tmp_path / "maps")
     path.write_text(replace(ALL_HOOKS, prior="/somewhere").to_toml())
     assert D2Config.from_toml(path).prior == "/somewhere"
     path.write_text("[densify\n")
-    with pytest.raises(D2Error, match="not valid TOML"):
-        D2Config.from_toml(path)
+    refuses("not valid TOML", D2Config.from_toml, path)
 
 
 def test_a_run_survives_its_file_and_names_another_version() -> None:
@@ -285,8 +280,7 @@ def test_a_run_survives_its_file_and_names_another_version() -> None:
     assert table["version"] == 1
     assert RunSettings.from_table(table, "run.json") == settings
     assert RunSettings.from_table({k: v for k, v in table.items() if k != "version"}, "run.json") == settings
-    with pytest.raises(D2Error, match=r"run\.json has settings of version 9"):
-        RunSettings.from_table(table | {"version": 9}, "run.json")
+    refuses(r"run\.json has settings of version 9", RunSettings.from_table, table | {"version": 9}, "run.json")
 
 
 @pytest.mark.parametrize("settings", [PriorSettings(), PriorSettings.paper(depth_range=(1, 9))])

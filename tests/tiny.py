@@ -37,8 +37,6 @@ def make_views() -> list[View]:
 
 
 class TinyFrames:
-    """Images of the plane."""
-
     def __init__(self) -> None:
         self.views = make_views()
 
@@ -55,7 +53,6 @@ class TinyStore:
     """The exact depth as a prior: left half verified, right half mono-only, one column in conflict."""
 
     def prior(self, camera: str, frame: int) -> DepthPrior:
-        """D* of any view."""
         labels = torch.full((HEIGHT, WIDTH), int(Label.MONO), dtype=torch.uint8)
         labels[:, : WIDTH // 2] = Label.VERIFIED
         labels[:, WIDTH // 2] = Label.CONFLICT
@@ -94,7 +91,6 @@ def bend_field(model: SplatModel, strength: float = 0.02) -> SplatModel:
 
 
 def make_adapter(model: SplatModel) -> Yang4DAdapter | DeformAdapter:
-    """The adapter of either bundled backbone."""
     return Yang4DAdapter(model) if isinstance(model, Yang4D) else DeformAdapter(model)
 
 
@@ -124,10 +120,8 @@ def parameters(trainer: Trainer) -> dict[str, Tensor]:
 
 
 def same(a: dict[str, Tensor], b: dict[str, Tensor]) -> bool:
-    """Bitwise equality of named tensors."""
     return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
 
 
 def is_finite(trainer: Trainer) -> bool:
-    """No parameter is NaN or infinite."""
     return all(math.isfinite(value.abs().max()) for value in parameters(trainer).values())

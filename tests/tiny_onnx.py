@@ -1,7 +1,5 @@
 """Tiny ONNX networks written as raw protobuf, so that tests need neither the onnx package nor a file from elsewhere."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

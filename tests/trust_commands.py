@@ -44,8 +44,6 @@ class Fault:
 
 @dataclass(frozen=True)
 class Ended:
-    """How a command ended."""
-
     code: int | None
     said: str
     operations: int = 0
@@ -101,14 +99,11 @@ class Commands:
         return Started(process, log)
 
     def run(self, words: list[str], fault: Fault | None = None, kill_after: float | None = None) -> Ended:
-        """A command, run to its end."""
         return self.start(words, fault, kill_after).end()
 
 
 @dataclass(frozen=True)
 class Started:
-    """A command that runs."""
-
     process: BaseProcess
     log: Path
 
@@ -125,12 +120,10 @@ class Started:
 
 
 def killed(ended: Ended) -> bool:
-    """Whether it ended by SIGKILL."""
     return ended.code == -signal.SIGKILL
 
 
 def _command(words: list[str], log: str, fault: tuple[str, int, int, int] | None, kill_after: float | None) -> None:
-    """What the new process does."""
     descriptor = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
     os.dup2(descriptor, 1)
     os.dup2(descriptor, 2)

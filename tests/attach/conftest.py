@@ -1,7 +1,5 @@
 """Fixtures of the tests that attach D2."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Every repository that has an adapter, as its mimic: how it is made, drawn, edited and saved."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -9,18 +7,7 @@ from types import ModuleType, SimpleNamespace
 from typing import Any, NamedTuple
 
 import torch
-from mimics import (
-    cem4dgs,
-    deformable3d,
-    ex4dgs,
-    fastergs4d,
-    fudan,
-    gsplat,
-    gsplat_dynamic,
-    hust4d,
-    spacetime,
-    swift4d,
-)
+from mimics import cem4dgs, deformable3d, ex4dgs, fastergs4d, fudan, gsplat, gsplat_dynamic, hust4d, spacetime, swift4d
 from mimics.inria import default_options, kept
 from tiny import make_views
 from torch import Tensor
@@ -242,7 +229,6 @@ def run(name: str, source: ModuleType | None = None, **options: Any) -> SimpleNa
 
 
 def snapshot(outcome: SimpleNamespace) -> dict[str, Tensor]:
-    """Every parameter of a trained model."""
     model = vars(outcome).get("gaussians", vars(outcome).get("splats", vars(outcome).get("params")))
     named = model.named_parameters() if isinstance(model, torch.nn.Module) else vars(model).items()
     return {key: value.detach().clone() for key, value in named if isinstance(value, torch.nn.Parameter)}

@@ -1,7 +1,5 @@
 """gsplat's dict of parameters: cameras, parameters and state; for the rest see test_every_repository.py."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from mimics import gsplat

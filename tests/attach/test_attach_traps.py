@@ -1,7 +1,5 @@
 """The traps of the official repositories, one by one: names, fields of view, batches, stages, probes, boxes."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -12,11 +10,12 @@ import torch
 from mimics import deformable3d, fudan, hust4d, spacetime
 from mimics.inria import Camera, cameras_of, default_options
 from mimics.workplace import HOOKS, some_points
+from refusals import refuses
 from repositories import VARIANTS, fudan_model
 from tiny import TinyStore, make_views
 from torch import Tensor
 
-from d2_plugin import D2Config, D2Error, D2Hooks
+from d2_plugin import D2Config, D2Hooks
 from d2_plugin.adapters.cameras import intrinsics
 from d2_plugin.adapters.deformable3d import Deformable3DAdapter
 from d2_plugin.adapters.fudan import FudanAdapter
@@ -40,8 +39,7 @@ class TestFieldsOfView:
     def test_a_camera_without_a_projection_is_refused(self) -> None:
         camera = cameras_of()[0]
         camera.projection_matrix = None
-        with pytest.raises(D2Error, match="has no projection_matrix: pass the trainer's own"):
-            FudanAdapter(fudan.make()[0]).view(camera)
+        refuses("has no projection_matrix: pass the trainer's own", FudanAdapter(fudan.make()[0]).view, camera)
 
     def test_minus_one_is_corrected_where_a_hook_is_on_and_left_alone_where_none_is(self) -> None:
         for config, corrected in ((D2Config(), False), (DEPTH_ALONE, True)):
@@ -126,8 +124,7 @@ class TestDeformations:
         assert d2.step(10).inserted == 0
         eager = D2Hooks(HOOKS, Hust4DAdapter(model, scene, "coarse", active_stages=("coarse", "fine")), TinyStore())
         assert isinstance(eager.loss(10, scene.cameras[:2]), Tensor)
-        with pytest.raises(D2Error, match="stage must be one of coarse, fine, got 'medium'"):
-            Hust4DAdapter(model, scene, "medium")
+        refuses("stage must be one of coarse, fine, got 'medium'", Hust4DAdapter, model, scene, "medium")
 
 
 @pytest.mark.parametrize(
@@ -138,8 +135,7 @@ class TestDeformations:
     ],
 )
 def test_another_codebase_than_the_adapters_is_refused(adapter: type, model: object, needed: str) -> None:
-    with pytest.raises(D2Error, match=f"SimpleNamespace has {needed} needs"):
-        adapter(model)
+    refuses(f"SimpleNamespace has {needed} needs", adapter, model)
 
 
 @pytest.mark.parametrize(
@@ -151,8 +147,7 @@ def test_another_codebase_than_the_adapters_is_refused(adapter: type, model: obj
     ],
 )
 def test_what_is_no_camera_of_the_codebase_is_refused(make: Callable, sentence: str) -> None:
-    with pytest.raises(D2Error, match=f"a camera of type dict {sentence}"):
-        make().view({})
+    refuses(f"a camera of type dict {sentence}", make().view, {})
 
 
 def test_points_inside_spacetime_have_its_own_start() -> None:

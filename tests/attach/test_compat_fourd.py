@@ -1,7 +1,5 @@
 """The stand-in for the 4D rasterizer, beside our own slices and published numbers."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

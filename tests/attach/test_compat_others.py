@@ -1,7 +1,5 @@
 """The rasterizers of SpacetimeGaussians and Ex4DGS, and torchvision, mmcv: what stands in for them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -36,7 +34,7 @@ class TestSpacetime:
         """The lite trainer gives nine background values for three channels (train.py:90)."""
         colors = torch.rand(40, channels, generator=torch.Generator().manual_seed(1)).to(scene.means)
         raster = spacetime.GaussianRasterizer(
-            spacetime.GaussianRasterizationSettings(**{**camera, "bg": torch.zeros(9)}),
+            spacetime.GaussianRasterizationSettings(**{**camera, "bg": torch.zeros(9)})
         )
         color, radii, depths = raster(
             means3D=scene.means, means2D=torch.zeros(40, 3), opacities=scene.opacities[:, None],

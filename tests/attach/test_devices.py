@@ -1,14 +1,13 @@
 """Views and Gaussians on different devices, and Gaussians that no compiled kernel draws."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from fake_gpu import OnGpu, fake_gpu, move  # noqa: F401  a fixture
+from refusals import refuses
 from repositories import VARIANTS
 from tiny import make_views
 
-from d2_plugin import D2Error, D2Hooks
+from d2_plugin import D2Hooks
 from d2_plugin.config import D2Config, DensifyConfig, DepthLossConfig
 from d2_plugin.protocol import Splats
 from d2_plugin.rasterizer import MOST_IN_TORCH, cuda, native, rasterize, survey
@@ -35,8 +34,7 @@ def test_a_backbone_that_leaves_it_there_is_told_which_view(hook: str) -> None:
     if hook == "densify":
         d2.loss(1, make_views()[0])
     run = (lambda: d2.step(1)) if hook == "densify" else (lambda: d2.loss(1, make_views()[0]))
-    with pytest.raises(D2Error, match=r"camera 'cam0' at frame 0 is on cpu but slice_at\(\) returned .* on cuda:0"):
-        run()
+    refuses(r"camera 'cam0' at frame 0 is on cpu but slice_at\(\) returned .* on cuda:0", run)
 
 
 @pytest.mark.usefixtures("fake_gpu")
@@ -67,7 +65,5 @@ def test_a_million_gaussians_without_kernels_are_refused(on_gpu: bool, monkeypat
 
     draw(10)
     sentence = rf"{MOST_IN_TORCH + 1} Gaussians on {'cuda:0' if on_gpu else 'cpu'} and no compiled kernels: plain torch"
-    with pytest.raises(D2Error, match=sentence):
-        draw(MOST_IN_TORCH + 1)
-    with pytest.raises(D2Error, match=sentence):
-        survey(splats(MOST_IN_TORCH + 1), view, None)
+    refuses(sentence, draw, MOST_IN_TORCH + 1)
+    refuses(sentence, survey, splats(MOST_IN_TORCH + 1), view, None)

@@ -1,7 +1,5 @@
 """Three lines attach D2 to every repository, and none of the repository's own behaviour is lost."""
 
-from __future__ import annotations
-
 import copy
 from pathlib import Path
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """Who trains from an export finds the priors of its source: by the path of the images, or by the configuration."""
 
-from __future__ import annotations
-
 import json
 import logging
 from pathlib import Path

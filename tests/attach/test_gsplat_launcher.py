@@ -1,7 +1,5 @@
 """gsplat's simple_trainer through the launcher: its modules in small, a stand-in to draw, cameras told by pose."""
 
-from __future__ import annotations
-
 import importlib
 import sys
 from collections.abc import Iterator
@@ -12,6 +10,8 @@ import numpy as np
 import pytest
 import torch
 from mimics import gsplat
+from mimics.workplace import HOOKS
+from refusals import refuses
 from splat_scenes import random_scene
 from tiny import TinyStore, make_views
 
@@ -21,7 +21,6 @@ from d2_plugin.adapters.keys import ViewsByPose
 from d2_plugin.attach.gsplat import GsplatSession, put_in_place
 from d2_plugin.attach.recipes import recipe
 from d2_plugin.compat import gsplat as stand_in
-from d2_plugin.config import DensifyConfig, DepthLossConfig, PruneConfig
 from d2_plugin.protocol import RasterSettings
 from d2_plugin.rasterizer import reference
 from d2_plugin.recordings.export.colmap import test_every as every_nth
@@ -120,13 +119,6 @@ def trained(config: D2Config | None) -> tuple[dict[str, torch.Tensor], GsplatSes
     return {name: value.detach() for name, value in runner.splats.items()}, session
 
 
-HOOKS = D2Config(
-    densify=DensifyConfig(start=3, stop=30, every=5, budget_per_view=15),
-    prune=PruneConfig(start=5, stop=30, every=5, patience=2, tau_p=0.6),
-    depth_loss=DepthLossConfig(every=1, weight=0.2),
-)
-
-
 @pytest.mark.usefixtures("checkout")
 def test_without_hooks_the_script_ends_with_the_same_bits() -> None:
     bare, _ = trained(None)
@@ -160,8 +152,7 @@ def test_the_export_that_the_parser_reads_renames_the_cameras(tmp_path: Path, mo
 @pytest.mark.usefixtures("checkout")
 def test_several_gpus_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
-    with pytest.raises(D2Error, match="train on 2 GPUs, and D2 follows one: set CUDA_VISIBLE_DEVICES=0"):
-        trained(None)
+    refuses("train on 2 GPUs, and D2 follows one: set CUDA_VISIBLE_DEVICES=0", trained, None)
 
 
 class TestViewsByPose:
@@ -184,11 +175,9 @@ class TestViewsByPose:
         twice = SimpleNamespace(
             camtoworlds=np.repeat(self.PARSER.camtoworlds[:1], 2, 0), image_names=["cam0_0000.png", "cam0_0001.png"]
         )
-        with pytest.raises(D2Error, match="2 images have the pose of this view"):
-            ViewsByPose(twice)(item)
+        refuses("2 images have the pose of this view", ViewsByPose(twice), item)
         item["camtoworld"] = item["camtoworld"] + 0.5
-        with pytest.raises(D2Error, match="0 images have the pose of this view"):
-            ViewsByPose(self.PARSER)(item)
+        refuses("0 images have the pose of this view", ViewsByPose(self.PARSER), item)
 
 
 class TestRasterization:
@@ -240,10 +229,8 @@ class TestRasterization:
     def test_what_needs_its_kernels_is_refused_by_name(self, given: tuple[dict, object]) -> None:
         with pytest.raises(D2Error, match="absgrad of gsplat's rasterization needs its own kernels"):
             stand_in.rasterization(**given[0], absgrad=True)
-        with pytest.raises(D2Error, match="render_mode 'RGB-Ed'"):
-            stand_in.rasterization(**given[0], render_mode="RGB-Ed")
-        with pytest.raises(D2Error, match="camera_model 'fisheye'"):
-            stand_in.rasterization(**given[0], camera_model="fisheye")
+        refuses("render_mode 'RGB-Ed'", stand_in.rasterization, **given[0], render_mode="RGB-Ed")
+        refuses("camera_model 'fisheye'", stand_in.rasterization, **given[0], camera_model="fisheye")
 
 
 @pytest.mark.parametrize(("trained_on", "held_out", "every"), [(4, 1, 5), (4, 4, 2), (7, 1, 8), (8, 2, 9), (6, 3, 4)])
@@ -253,7 +240,5 @@ def test_every_nth_image_is_held_out(trained_on: int, held_out: int, every: int)
 
 
 def test_a_number_of_cameras_that_the_parser_cannot_hold_out_is_refused() -> None:
-    with pytest.raises(D2Error, match=r"no N gives 4 of 6"):
-        every_nth(2, 4)
-    with pytest.raises(D2Error, match=r"no N gives 0 of 4"):
-        every_nth(4, 0)
+    refuses(r"no N gives 4 of 6", every_nth, 2, 4)
+    refuses(r"no N gives 0 of 4", every_nth, 4, 0)

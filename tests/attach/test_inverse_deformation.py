@@ -1,7 +1,5 @@
 """Inversion of a deformation field: exact where it can be, damped where it must be, honest where it cannot be."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from torch import Tensor

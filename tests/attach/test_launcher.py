@@ -1,7 +1,5 @@
 """The launcher: somebody else's train.py with D2 attached and no line of it edited."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
@@ -14,7 +12,7 @@ import torch
 from mimics import fudan, hust4d
 from mimics.inria import default_options
 from mimics.page import attached
-from mimics.workplace import furnish
+from mimics.workplace import HOOKS, furnish
 from tiny import TinyStore
 
 from d2_plugin import D2Config, D2Error, D2Hooks
@@ -24,15 +22,10 @@ from d2_plugin.attach.launch import main
 from d2_plugin.attach.packages import provide
 from d2_plugin.attach.recipes import RECIPES, recipe
 from d2_plugin.attach.session import Original, Session
-from d2_plugin.config import DensifyConfig, DepthLossConfig, PruneConfig
+from d2_plugin.config import DepthLossConfig
 from d2_plugin.hooks.reports import Report, RunLog
 
 DEPTH_LOSS = D2Config(depth_loss=DepthLossConfig(start=2))
-EDITS = D2Config(
-    densify=DensifyConfig(start=5, stop=12, every=10, budget_per_view=15),
-    prune=PruneConfig(start=5, stop=12, every=10, patience=2, tau_p=0.6),
-    depth_loss=DepthLossConfig(every=1, weight=0.2),
-)
 OPTIONS = default_options(iterations=12, densify_until_iter=0)
 
 
@@ -106,12 +99,12 @@ class TestSession:
         torch.testing.assert_close(launched, three_lines, atol=2e-5, rtol=1e-4)
 
     def test_edits_happen_after_zero_grad_and_are_counted(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        positions, session = run_wrapped(EDITS, monkeypatch)
+        positions, session = run_wrapped(HOOKS, monkeypatch)
         assert session.hooks.log.inserted > 0
         assert len(positions) == len(session.hooks.backbone)
 
     def test_growth_beyond_what_was_inserted_is_logged_once(self, caplog: pytest.LogCaptureFixture) -> None:
-        session = Session(recipe("fudan"), EDITS, TinyStore())
+        session = Session(recipe("fudan"), HOOKS, TinyStore())
         done = RunLog({})
         done._at_first = 100  # Gaussians when D2 was attached
         for step, (inserted, removed, count) in enumerate([(10, 0, 130), (0, 20, 120), (0, 0, 121), (0, 0, 121)], 1):
@@ -177,9 +170,7 @@ class TestOriginals:
             provide((Original(self.NAME, STAND_IN, "built.py"),), tmp_path, on_cpu=False, replace_broken=False)
 
     @pytest.mark.parametrize(("built", "works"), [("object()", True), ("None", False)])
-    def test_gsplat_is_what_its_own_loader_loads_or_builds(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, built: str, works: bool
-    ) -> None:
+    def test_gsplat_is_what_its_own_loader_loads_or_builds(self, tmp_path, monkeypatch, built, works) -> None:
         """As PyPI ships it, it builds its kernels at first use and never has `gsplat.csrc`."""
         for name in [name for name in sys.modules if name.split(".")[0] == "gsplat"]:
             monkeypatch.delitem(sys.modules, name)

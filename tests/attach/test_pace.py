@@ -1,7 +1,5 @@
 """Trainers whose optimizer begins with small steps: schedules count what these are worth."""
 
-from __future__ import annotations
-
 import logging
 
 import pytest

@@ -1,7 +1,5 @@
 """What a trainer imports and this environment lacks: found in its files, stood in for in memory, or asked for."""
 
-from __future__ import annotations
-
 import json
 import os
 import sys
@@ -11,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from refusals import refuses
 
 from d2_plugin.attach import cpu, repairs
 from d2_plugin.attach.packages import STAND_INS, StandIn, missing, needed, needs, stand_in_for
@@ -55,8 +54,7 @@ def test_what_an_option_imports_is_stood_in_for_but_not_asked_for(script: Path, 
     script.write_text(f"import torch\nif __name__ == '__main__':\n    import absent_three\n{option}")
     assert set(needed(script)) == {"torch", "absent_three", "absent_four"}
     assert set(needed(script, conditional=False)) == {"torch", "absent_three"}
-    with pytest.raises(D2Error, match="run `pip install absent_three`"):
-        stand_in_for(script, set())
+    refuses("run `pip install absent_three`", stand_in_for, script, set())
     assert needs(recipe("fudan"), script).splitlines()[-1] == "install what is missing: `pip install absent_three`"
     monkeypatch.setitem(STAND_INS, "absent_four", StandIn({}, "it is made up"))
     monkeypatch.setitem(STAND_INS, "absent_three", StandIn({}, "it is made up"))
@@ -71,8 +69,7 @@ def test_what_an_option_imports_is_stood_in_for_but_not_asked_for(script: Path, 
 
 def test_what_nothing_stands_in_for_is_one_sentence_with_the_command(script: Path) -> None:
     sentence = r"absent_one \(thirdparty.*:2\), absent_two .*run `pip install absent_one absent_two`"
-    with pytest.raises(D2Error, match=sentence):
-        stand_in_for(script, set())
+    refuses(sentence, stand_in_for, script, set())
 
 
 def test_ours_takes_the_place_and_the_rest_says_so_when_it_is_called(script: Path, monkeypatch, caplog) -> None:
@@ -87,8 +84,7 @@ def test_ours_takes_the_place_and_the_rest_says_so_when_it_is_called(script: Pat
 
     assert clamp is torch.clamp
     assert absent_one.part.clamp is torch.clamp
-    with pytest.raises(D2Error, match="the trainer calls absent_two.deeper.Anything, and absent_two is missing"):
-        Anything(1)
+    refuses("the trainer calls absent_two.deeper.Anything, and absent_two is missing", Anything, 1)
 
 
 def test_what_newer_libraries_dropped_is_restored(monkeypatch) -> None:
@@ -145,8 +141,7 @@ def test_the_doctor_lists_what_a_trainer_lacks(script: Path, monkeypatch) -> Non
     assert "the launcher stands in for it; it is made up" in report
     assert "d2_plugin.compat.nearest" in report
     assert report.splitlines()[-1] == "install what is missing: `pip install absent_one`"
-    with pytest.raises(D2Error, match="no train.py in .* give the folder of the repository"):
-        needs(recipe("fudan"), script.parent / "thirdparty")
+    refuses("no train.py in .* give the folder of the repository", needs, recipe("fudan"), script.parent / "thirdparty")
 
 
 def test_a_script_that_is_no_python_is_one_sentence(tmp_path: Path) -> None:

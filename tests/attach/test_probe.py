@@ -1,7 +1,5 @@
 """Whether a trainer's own render may stand in for ours, alone and in a batch."""
 
-from __future__ import annotations
-
 import logging
 
 import pytest
@@ -20,9 +18,7 @@ DEPTH_ALONE = D2Config(depth_loss=DepthLossConfig(every=1))
 
 
 class TestProbe:
-    def test_fudans_own_renders_of_a_batch_are_used_view_by_view_and_equal_ours(
-        self, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
+    def test_fudans_own_renders_of_a_batch_are_used_view_by_view_and_equal_ours(self, caplog, monkeypatch) -> None:
         model, scene = fudan_model()
         adapter, cameras = FudanAdapter(model, scene), scene.train_cameras[1.0][:2]
         d2 = D2Hooks(DEPTH_ALONE, adapter, TinyStore())

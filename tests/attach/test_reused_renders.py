@@ -1,7 +1,5 @@
 """What the trainer evaluated to draw a view is not evaluated again for D2's depth of that view."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from types import SimpleNamespace
 

@@ -1,7 +1,5 @@
 """Three lines are not silent: what is attached, progress now and then, a summary; to log, callback and writer."""
 
-from __future__ import annotations
-
 import logging
 import math
 import tomllib

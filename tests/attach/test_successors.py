@@ -1,7 +1,5 @@
 """gsplat's contrib.dynamic, Swift4D and CEM-4DGS: what is particular to each."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 

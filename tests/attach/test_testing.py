@@ -1,7 +1,5 @@
 """`check_backbone` passes what keeps the contract and names, in a sentence, each way to break it."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -134,7 +132,6 @@ def one_listener(adapter: WatchedModel) -> None:
 
 
 def early(adapter: WatchedModel) -> None:
-    """Reports before the change."""
     report, select = adapter._report, type(adapter.model).select
     adapter.model.select = lambda index: (report(index), select(adapter.model, index))
 

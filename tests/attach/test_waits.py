@@ -3,8 +3,6 @@
 Counted on a GPU that is not there (`fake_gpu`), with the real kernels of gpu.cu in their shim.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 
 import pytest

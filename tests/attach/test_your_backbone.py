@@ -1,7 +1,5 @@
 """docs/your-backbone.md is true: its blocks, put into files as printed, pass their test and train with the hooks."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

@@ -1,7 +1,5 @@
 """The bundled deformation backbone: its field, where it is still, how it learns, what is left out."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest
@@ -10,14 +8,7 @@ import torch.nn.functional as F
 from tiny import bend_field, make_adapter, make_model, make_trainer, make_views, parameters
 
 from d2_plugin.backbones.deform import Deform
-from d2_plugin.backbones.deform_fields import (
-    SPACE_PAIRS,
-    Box,
-    HexPlaneField,
-    HexPlaneSettings,
-    at_instant,
-    bend,
-)
+from d2_plugin.backbones.deform_fields import SPACE_PAIRS, Box, HexPlaneField, HexPlaneSettings, at_instant, bend
 from d2_plugin.backbones.densify import grow
 from d2_plugin.gaussians.slicing import MARGINAL_CUT, slice_gaussians
 from d2_plugin.protocol import Points

@@ -1,22 +1,11 @@
 """The colour at infinity, and cameras of different exposure: begun with the images, learnt, saved with the model."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
 import pytest
 import torch
-from tiny import (
-    ALL_HOOKS,
-    BACKBONES,
-    TinyFrames,
-    TinyStore,
-    make_adapter,
-    make_model,
-    make_trainer,
-    make_views,
-)
+from tiny import ALL_HOOKS, BACKBONES, TinyFrames, TinyStore, make_adapter, make_model, make_trainer, make_views
 from torch import Tensor
 
 from d2_plugin.backbones import background as module

@@ -1,10 +1,7 @@
 """What the plugin promises of every backbone: rows stay together through any edits, a resumed run is the same run."""
 
-from __future__ import annotations
-
 import io
 import math
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -130,9 +127,7 @@ def test_all_hooks_off_is_bitwise_the_bare_trainer(backbone: str, temporal: bool
 
 
 @pytest.mark.parametrize(("config", "count"), [(ALL_HOOKS, 2), (D2Config(), 1)])
-def test_a_resumed_run_is_bitwise_the_uninterrupted_one(
-    backbone: str, config: D2Config, count: int, threads: Callable[[int], None]
-) -> None:
+def test_a_resumed_run_is_bitwise_the_uninterrupted_one(backbone: str, config: D2Config, count: int, threads) -> None:
     threads(count)
     whole, first = (make_trainer(config, 20, backbone=backbone, appearance=True) for _ in range(2))
     whole.run()
@@ -197,9 +192,7 @@ def test_what_hardly_shows_is_left_out_at_the_end_of_a_run(backbone: str) -> Non
 
 
 @pytest.mark.parametrize(("iterations", "looks"), [(23, False), (24, True)])
-def test_a_run_of_four_steps_for_each_view_ends_with_a_look_at_each(
-    backbone: str, iterations: int, looks: bool
-) -> None:
+def test_a_run_of_four_steps_for_each_view_ends_with_a_look_at_each(backbone, iterations, looks) -> None:
     trainer, counts = make_trainer(iterations=iterations, backbone=backbone, densify=DensifySettings(every=1000)), []
     with torch.no_grad():
         trainer.model.gaussians["opacity_logits"][7] = -20.0

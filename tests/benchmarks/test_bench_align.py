@@ -1,7 +1,5 @@
 """`python -m benchmarks`: peers of the fit solve what they claim, scenes are what they are called."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

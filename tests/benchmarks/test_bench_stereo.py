@@ -1,7 +1,6 @@
 """`python -m benchmarks`: scores of stereo and priors are what they are called, maps are spoiled as said."""
 
-from __future__ import annotations
-
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -112,9 +111,8 @@ def test_frames_with_truth_are_those_of_any_of_the_cameras(tmp_path: Path) -> No
 
 
 @pytest.fixture(scope="module")
-def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    recording = synthetic_recording(2, held_out=1, frames=2, width=96, height=54, arc_degrees=15)
-    return save_recording(recording, tmp_path_factory.mktemp("recordings") / "room")
+def room(saved_room: Callable[..., Path]) -> Path:
+    return saved_room(cameras=2, held_out=1, frames=2, width=96, height=54, arc_degrees=15)
 
 
 @pytest.mark.parametrize("kind", SPOILED)

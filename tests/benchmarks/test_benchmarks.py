@@ -1,7 +1,5 @@
 """What holds for every part of `python -m benchmarks`: settings, help, where rows go, and the page of them all."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 
@@ -11,7 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from benchmarks import memory, scaling
-from benchmarks.__main__ import main
+from benchmarks.__main__ import PARTS, main
+from benchmarks.gpu import proof as gpu
 from benchmarks.memory import in_fresh_process
 from benchmarks.report import EVERY
 from benchmarks.work_precision import means, pareto_front, work_precision
@@ -24,9 +23,7 @@ RUNS = Path(__file__).parents[1] / "data" / "runs.jsonl"
 LINUX = pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="peak memory is measured on Linux")
 
 
-def test_parts_are_found_from_any_folder_and_a_mistake_is_one_sentence(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_parts_are_found_from_any_folder_and_a_mistake_is_one_sentence(tmp_path: Path, monkeypatch, capsys) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [place for place in sys.path if Path(place).resolve() != CHECKOUT])
     for name in [name for name in sys.modules if name.partition(".")[0] == "benchmarks"]:
@@ -50,12 +47,7 @@ def test_parts_are_found_from_any_folder_and_a_mistake_is_one_sentence(
     ],
 )
 def test_a_part_adds_rows_of_what_it_measured_and_prints_their_tables(
-    words: str,
-    rows: int,
-    shown: str,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+    words, rows, shown, tmp_path, capsys, monkeypatch
 ) -> None:
     monkeypatch.setattr("torch.set_num_threads", lambda count: None)
     monkeypatch.setattr(scaling, "in_fresh_process", lambda work, *given: memory.Measured(work(*given), 1.0))
@@ -81,6 +73,13 @@ def test_each_kind_becomes_a_section_also_where_nothing_has_a_result(kind: str, 
         assert f'<section id="{kind}">' in page.read_text()
         assert all(f"]({plot.name})" in text.read_text() for plot in plots)
         assert name == "whole" or kind not in BUILDERS or "refused" in text.read_text()
+
+
+@pytest.mark.parametrize("name", ["raster", "stereo-cuda", "profile"])
+def test_a_step_of_the_proof_on_a_gpu_calls_a_part_with_words_that_the_part_takes(name: str) -> None:
+    called = gpu.STEPS[name].words(gpu.GpuBench())
+    part, *given = called[called.index("benchmarks") + 1 :]
+    PARTS[part].form(part).parse(given)
 
 
 def measured(method: str, setting: str, error: float | None, seconds: float | None, failed: str | None = None) -> Row:

@@ -1,7 +1,5 @@
 """The rivals' losses are the published ones: golden values from numpy, gradients by differences, stiff maps."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -25,8 +23,6 @@ from d2_plugin.errors import D2Error
 from d2_plugin.hooks import Context, Hook, HookConfig
 from d2_plugin.hooks.prior import PriorLoader
 from d2_plugin.protocol import View
-from d2_plugin.recordings.export.folder import save_recording
-from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.runs.ablation.ablate import ablate
 from d2_plugin.runs.ablation.presets import PRESETS, rows_named
 from d2_plugin.runs.rows import read_rows
@@ -161,7 +157,6 @@ def test_hard_depth_moves_centres_and_soft_depth_fades_gaussians_and_nothing_els
     hook = PatchNorm(PatchNormConfig(soft_start=soft_start), OneMap())
     context = Context(5, adapter, make_views()[:1], PriorLoader(TinyStore()), torch.Generator().manual_seed(0))
     loss = hook.loss(context)
-    assert loss is not None
     loss.backward()
     trained = adapter.trained()
     assert {name for name, value in trained.items() if value.grad is not None and value.grad.any()} == wanted
@@ -181,9 +176,8 @@ def test_hard_depth_draws_what_ends_fainter(backbone: str) -> None:
 
 
 @pytest.fixture(scope="module")
-def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    recording = synthetic_recording(cameras=2, held_out=1, frames=2, width=96, height=54)
-    return save_recording(recording, tmp_path_factory.mktemp("recordings") / "room")
+def room(saved_room: Callable[..., Path]) -> Path:
+    return saved_room(cameras=2, held_out=1, frames=2, width=96, height=54)
 
 
 @pytest.fixture(scope="module")
@@ -203,7 +197,6 @@ def folder_of(output: Path, method: str) -> Path:
 
 
 def run_of(output: Path, name: str) -> Run:
-    """The run of a rival."""
     stored = read_run(folder_of(output, name))
     rival = guidance(stored.pop("guidance")["name"], 24)
     return Run(RunSettings.from_table(stored, "run.json"), folder_of(output, name), rival)

@@ -1,7 +1,5 @@
 """The bench of the official trainers: its table from rows, what it asks each script for, and one run of a mimic."""
 
-from __future__ import annotations
-
 import json
 import os
 import sys
@@ -165,9 +163,7 @@ def checkout(tmp_path: Path) -> Path:
     return folder
 
 
-def test_a_trainer_runs_in_its_own_process_and_leaves_rows_and_a_table(
-    checkout: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_trainer_runs_in_its_own_process_and_leaves_rows_and_a_table(checkout: Path, tmp_path, monkeypatch) -> None:
     prior, truth = furnish(tmp_path, monkeypatch) / "prior", true_images(tmp_path)
 
     def prepared(source: Source, trial: Trial, work: Path) -> Prepared:
@@ -208,9 +204,7 @@ ITERATIONS = int(os.environ.get("D2_CHECKOUT_ITERATIONS", "60"))
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", TRIALS)
-def test_the_official_trainer_bare_without_hooks_and_attached(
-    name: str, tmp_path: Path, shared_data: Callable[[str], Path], capsys: pytest.CaptureFixture
-) -> None:
+def test_the_official_trainer_bare_without_hooks_and_attached(name: str, tmp_path, shared_data, capsys) -> None:
     """D2_CHECKOUTS is a folder with a checkout of each repository; D2_CHECKOUT_ITERATIONS how long each run is."""
     if CHECKOUTS is None:
         pytest.skip("D2_CHECKOUTS is not set: give a folder with one checkout per repository")

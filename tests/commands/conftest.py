@@ -1,22 +1,16 @@
 """A recording small enough to train on in seconds."""
 
-from __future__ import annotations
-
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from small_layouts import write_layout
 
-from d2_plugin.recordings.export.folder import save_recording
-from d2_plugin.recordings.synthetic.room import synthetic_recording
-
 
 @pytest.fixture(scope="session")
-def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def recording(saved_room: Callable[..., Path]) -> Path:
     """Three cameras and a held-out one, two frames of 96x54."""
-    pytest.importorskip("cv2", reason="opencv is in the `image` extra")
-    path = tmp_path_factory.mktemp("recording") / "room"
-    return save_recording(synthetic_recording(cameras=3, held_out=1, frames=2, width=96, height=54), path)
+    return saved_room(cameras=3, held_out=1, frames=2, width=96, height=54)
 
 
 @pytest.fixture(scope="session")

@@ -1,7 +1,5 @@
 """What the command line makes of mistakes, faults and Ctrl-C: one sentence, an exit code, no traceback."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil
@@ -54,9 +52,7 @@ class TestTheBoundary:
             (RuntimeError("DefaultCPUAllocator: can't allocate memory: 9 bytes"), 2, "smaller with --downscale 2"),
         ],
     )
-    def test_says_what_to_do(
-        self, failing: Callable, capsys: pytest.CaptureFixture[str], failure: BaseException, code: int, says: str
-    ) -> None:
+    def test_says_what_to_do(self, failing: Callable, capsys, failure: BaseException, code: int, says: str) -> None:
         failing(failure)
         assert main(["train"]) == code
         error = capsys.readouterr().err
@@ -64,7 +60,7 @@ class TestTheBoundary:
         assert says in error
         assert len(error.splitlines()) == 1
 
-    def test_debug_shows_where_it_arose(self, failing: Callable, capsys: pytest.CaptureFixture[str]) -> None:
+    def test_debug_shows_where_it_arose(self, failing: Callable, capsys) -> None:
         failing(D2Error("no such thing: write it"))
         assert main(["train", "--debug"]) == 2
         lines = capsys.readouterr().err.splitlines()
@@ -109,9 +105,7 @@ class TestWords:
             (["--depth-loss.weight", "1e308"], "--depth-loss.weight must be"),
         ],
     )
-    def test_values_that_cannot_be(
-        self, small: Path, tmp_path: Path, refused: Refused, words: list[str], says: str
-    ) -> None:
+    def test_values_that_cannot_be(self, small: Path, tmp_path, refused: Refused, words: list[str], says: str) -> None:
         fixed = ["train", str(small), "--train-cameras", "cam00", "--output", str(tmp_path / "x")]
         assert says in refused(*fixed, *words)
         assert not (tmp_path / "x").exists()
@@ -162,9 +156,7 @@ class TestPlaces:
         (copy / "cameras.json").write_text(json.dumps(described))
         assert "rename it" in refused("plan", str(copy), "--train-cameras", "cam01")
 
-    def test_a_depth_map_that_only_evaluation_reads_is_named_before_training(
-        self, copy: Path, tmp_path: Path, refused: Refused
-    ) -> None:
+    def test_a_depth_map_that_only_evaluation_reads_is_named_before_training(self, copy, tmp_path, refused) -> None:
         (copy / "depth" / "cam01" / "00001.npz").write_bytes(b"PK\x03\x04 no archive")
         words = ["train", str(copy), "--train-cameras", "cam00", "--hooks", "none", "--output", str(tmp_path / "x")]
         assert "00001.npz" in refused(*words)

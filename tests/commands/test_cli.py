@@ -1,7 +1,5 @@
 """The `d2` command as a person uses it: from recording to score, the demo, and one sentence for every mistake."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Callable
@@ -74,7 +72,7 @@ def test_evaluating_again_gives_the_same_scores(finished: Path) -> None:
 
 
 def test_priors_are_built_in_parts_and_shown_on_a_sheet(
-    recording: Path, finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    recording: Path, finished: Path, tmp_path, capsys, answered
 ) -> None:
     build = ["priors", str(recording), "--train-cameras", CAMERAS, "--output", str(tmp_path)]
     assert main([*build, "--shard", "2/2"]) == 0
@@ -82,8 +80,7 @@ def test_priors_are_built_in_parts_and_shown_on_a_sheet(
     told = capsys.readouterr().out
     assert "held against" not in told, "a part is not the whole"
     assert "here monocular depth" not in told, "and is not tried out"
-    assert main(build) == 0
-    told = capsys.readouterr().out
+    told = answered(*build)
     assert "verified" in told
     assert "held against the true depth of" in told
     assert "here monocular depth is" in told, "what left-out cameras showed, for every trainer that reads this prior"
@@ -94,9 +91,7 @@ def test_priors_are_built_in_parts_and_shown_on_a_sheet(
         assert np.array_equal(whole.prior(camera, 1).depth, joined.prior(camera, 1).depth)
 
 
-def test_a_hook_that_changes_nothing_retires_and_the_scores_say_so(
-    recording: Path, finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_hook_that_changes_nothing_retires_and_the_scores_say_so(recording, finished, tmp_path, capsys) -> None:
     config = tmp_path / "config.toml"
     config.write_text("[d2]\nretire_after = 2\n[densify]\nmax_gaussians = 0\n")
     hooks = ["--hooks", "densify", "--priors", str(finished / "priors"), "--config", str(config)]
@@ -108,19 +103,16 @@ def test_a_hook_that_changes_nothing_retires_and_the_scores_say_so(
 @pytest.mark.parametrize(
     ("shard", "says"), [("1/2 --workers 2", "leave it out"), ("3/2", "parts are 1 to 2"), ("half", "give I/N")]
 )
-def test_a_part_that_cannot_be_built_is_refused(
-    recording: Path, tmp_path: Path, refused: Refused, shard: str, says: str
-) -> None:
+def test_a_part_that_cannot_be_built_is_refused(recording: Path, tmp_path, refused, shard: str, says: str) -> None:
     build = ["priors", recording, "--train-cameras", CAMERAS, "--output", tmp_path / "priors", "--shard"]
     assert says in refused(*build, *shard.split())
 
 
 def test_compare_tabulates_what_was_measured_and_keeps_runs_of_one_name_apart(
-    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    finished: Path, tmp_path, answered
 ) -> None:
     other = shutil.copytree(finished, tmp_path / finished.name)
-    assert main(["compare", str(finished), str(other)]) == 0
-    lines = capsys.readouterr().out.splitlines()
+    lines = answered("compare", str(finished), str(other)).splitlines()
     header, _, *rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines]
     metrics = json.loads((finished / "metrics.json").read_text())
     for row, run in zip(rows, (finished, other), strict=True):
@@ -146,12 +138,9 @@ def test_plan_names_each_decision_with_its_measurement(recording: Path, capsys: 
     assert "(emulated)" in lines[2]
 
 
-def test_plan_says_the_rate_of_the_chosen_frames_and_that_no_clock_is_known(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_plan_says_the_rate_of_the_chosen_frames_and_that_no_clock_is_known(tmp_path: Path, answered) -> None:
     room = save_recording(synthetic_recording(cameras=2, held_out=0, frames=5, width=96, height=54), tmp_path / "room")
-    assert main(["plan", str(room), "--train-cameras", "all", "--frames", "0:4:2"]) == 0
-    said = capsys.readouterr().out
+    said = answered("plan", str(room), "--train-cameras", "all", "--frames", "0:4:2")
     assert "frames 0 to 4 (3) at 6 per second" in said
     assert "nothing says how the cameras were synchronised" in said
 
@@ -160,9 +149,7 @@ def test_the_doctor_of_a_recording_names_the_plan(recording: Path, refused: Refu
     assert f"d2 plan {recording}" in refused("doctor", recording)
 
 
-def test_one_instant_leaves_the_temporal_dimension_out_and_all_cameras_may_train(
-    recording: Path, tmp_path: Path
-) -> None:
+def test_one_instant_leaves_the_temporal_dimension_out_and_all_cameras_may_train(recording: Path, tmp_path) -> None:
     run = tmp_path / "still"
     assert train(recording, run, "--frames", "1:1", "--hooks", "none", "--train-cameras", f"{CAMERAS},test0") == 0
     metrics = json.loads((run / "metrics.json").read_text())
@@ -186,9 +173,7 @@ def test_an_output_folder_of_another_run_or_with_other_files_is_left_alone(
     assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
 
 
-def test_instants_between_the_trained_ones_have_their_own_score(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_instants_between_the_trained_ones_have_their_own_score(tmp_path: Path, capsys) -> None:
     room = synthetic_recording(cameras=3, held_out=1, frames=5, width=48, height=27)
     folder = save_recording(room, tmp_path / "longer")
     assert train(folder, tmp_path / "run", "--hold-out-instants", "2", "--hooks", "none") == 0
@@ -202,9 +187,7 @@ class Stopped(BaseException):
     """Raised where a test ends the demo."""
 
 
-def test_a_demo_cut_off_while_it_writes_its_recording_goes_on(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_demo_cut_off_while_it_writes_its_recording_goes_on(tmp_path: Path, monkeypatch, answered) -> None:
     tiny = synthetic_recording(cameras=3, held_out=1, frames=2, width=96, height=54)
     monkeypatch.setattr(demo, "synthetic_recording", lambda: tiny)
     command = ["demo", "--output", str(tmp_path / "demo"), "--iterations", "4"]
@@ -220,8 +203,7 @@ def test_a_demo_cut_off_while_it_writes_its_recording_goes_on(
         with pytest.raises(Stopped):
             main(command)
     assert len(written) == 3
-    assert main(command) == 0
-    out = capsys.readouterr().out
+    out = answered(*command)
     assert all(f"| {name}" in out for name in demo.VARIANTS)
     assert (tmp_path / "demo" / "comparison.png").is_file()
     assert f"Player: {tmp_path / 'demo' / 'player.html'}" in out

@@ -102,9 +102,7 @@ class TestValues:
             (Unions, ["--sizes", "1:3"], "sizes", (1, 2, 3)),
         ],
     )
-    def test_each_kind_is_written_as_a_person_writes_it(
-        self, kind: type, words: list[str], name: str, value: object
-    ) -> None:
+    def test_each_kind_is_written_as_a_person_writes_it(self, kind, words, name, value) -> None:
         found = getattr(given(*words, kind=kind).make(kind), name)
         assert found == value
         assert type(found) is type(value)

@@ -1,13 +1,9 @@
 """What a person reads while work goes on."""
 
-import pytest
-
 from d2_plugin import progress
 
 
-def test_the_time_left_is_that_of_the_work_not_of_what_began_it(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_time_left_is_that_of_the_work_not_of_what_began_it(monkeypatch, capsys) -> None:
     """Workers that take 40 s to start, then a unit a second: 65 s are left for 65 units, not five minutes."""
     now = 0.0
     monkeypatch.setattr(progress.time, "monotonic", lambda: now)

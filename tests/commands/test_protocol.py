@@ -1,7 +1,5 @@
 """`d2 protocol`: a published evaluation is one command; it says what differs, and repeats to the last digit."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path

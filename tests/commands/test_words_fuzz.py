@@ -1,13 +1,10 @@
 """Command lines and configurations at random: an answer, or one sentence that is no fault of ours."""
 
-from __future__ import annotations
-
 import functools
 import importlib.metadata
 import os
 import random
 import string
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -70,9 +67,7 @@ def fuzz_words(count: int, seed: int, small: Path, tmp_path: Path, capsys: pytes
 
 
 @pytest.mark.parametrize(("count", "seed"), ROUNDS)
-def test_configurations_at_random(
-    small: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], count: int, seed: int
-) -> None:
+def test_configurations_at_random(small: Path, tmp_path: Path, capsys, count: int, seed: int) -> None:
     path = tmp_path / "d2.toml"
     tables = for_iterations(("densify", "prune", "depth_loss"), 100).to_toml().splitlines()
     whole = "\n".join(
@@ -143,23 +138,13 @@ def installed_once(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("fuzz", [fuzz_flags, fuzz_words])
 @pytest.mark.parametrize(("count", "seed"), ROUNDS)
-def test_odd_flags_and_command_lines_at_random(
-    fuzz: Callable[..., None],
-    small: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-    count: int,
-    seed: int,
-) -> None:
+def test_odd_flags_and_command_lines_at_random(fuzz, small, tmp_path, capsys, monkeypatch, count, seed) -> None:
     monkeypatch.chdir(tmp_path)
     fuzz(count, seed, small, tmp_path, capsys)
 
 
 @pytest.mark.parametrize(("count", "seed"), ROUNDS)
-def test_the_environment_at_random(
-    small: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, count: int, seed: int
-) -> None:
+def test_the_environment_at_random(small: Path, capsys, monkeypatch, count: int, seed: int) -> None:
     for number in range(count // 4):
         rng = random.Random(f"environment {seed} {number}")
         with monkeypatch.context() as changed:

@@ -1,7 +1,5 @@
 """The slice of a 4D Gaussian: golden vectors, the kernel against torch, and where numbers end."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -30,13 +28,7 @@ from d2_plugin.gaussians.slicing import reference_slice
 OUTPUTS = ("means", "covariances", "opacities")
 
 
-@pytest.fixture
-def compiled() -> None:
-    if kernel.library() is None:
-        pytest.skip("there is no C++ compiler")
-
-
-needs_compiler = pytest.mark.usefixtures("compiled")
+needs_compiler = pytest.mark.usefixtures("compiler")
 
 
 @pytest.fixture(params=[True, False], ids=["temporal", "static"])

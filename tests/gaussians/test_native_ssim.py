@@ -1,7 +1,5 @@
 """The photometric loss and the background in the kernel are those in torch: value, gradient, borders, threads."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 
@@ -16,13 +14,8 @@ from d2_plugin.gaussians import native_ssim as kernel
 from d2_plugin.gaussians.photometric import photometric_loss, reference_photometric_loss
 from d2_plugin.protocol import Render, View
 
+pytestmark = pytest.mark.usefixtures("compiler")
 SIZES = [(1, 1), (1, 40), (40, 1), (11, 11), (37, 23), (150, 160)]
-
-
-@pytest.fixture(autouse=True)
-def compiled() -> None:
-    if kernel.library() is None:
-        pytest.skip("there is no C++ compiler")
 
 
 def images(height: int, width: int, channels: int = 3, seed: int = 0, noise: float = 0.1) -> tuple[Tensor, Tensor]:
@@ -47,9 +40,7 @@ def loss_with_gradient(
     + [((20, 30, 3), weight) for weight in (1e-3, 1.0)],
 )
 @pytest.mark.parametrize("transposed", [False, True], ids=["", "transposed"])
-def test_value_and_gradient_are_those_of_torch_in_float64(
-    shape: tuple[int, int, int], weight: float, transposed: bool
-) -> None:
+def test_value_and_gradient_are_those_of_torch_in_float64(shape, weight, transposed) -> None:
     image, target = images(*shape)
     if transposed:  # and so not contiguous
         image, target = image.transpose(0, 1), target.flip(0).transpose(0, 1)

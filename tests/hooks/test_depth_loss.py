@@ -1,7 +1,5 @@
 """Verified-depth supervision: the paper's loss, what sigma and far pixels add, by torch and by the kernel."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -14,7 +12,6 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from d2_plugin.hooks import depth_loss as module
-from d2_plugin.hooks import native_depth_loss
 from d2_plugin.hooks import prior as loading
 from d2_plugin.hooks.densify import Densify, DensifyConfig, rendered_depth, under_reconstructed
 from d2_plugin.hooks.depth_loss import DepthLossConfig, supervision
@@ -90,13 +87,7 @@ class TestRender:
         torch.testing.assert_close(by_alpha.float(), torch.where(near, -DepthLossConfig().opaque / near.sum(), 0.0))
 
 
-@pytest.fixture
-def compiled() -> None:
-    if native_depth_loss.library() is None:
-        pytest.skip("there is no C++ compiler")
-
-
-@pytest.mark.usefixtures("compiled")
+@pytest.mark.usefixtures("compiler")
 class TestKernel:
     @pytest.mark.parametrize("size", [(1, 1), (1, 17), (3, 5), (61, 67), (90, 130)])
     @pytest.mark.parametrize("paper", [False, True])
@@ -115,9 +106,7 @@ class TestKernel:
                     assert not slope[known.kind == 0].any()
 
     @pytest.mark.parametrize("scale", [1e-20, 1e20, 1e30])
-    def test_depths_beyond_the_range_of_squares_are_as_in_torch(
-        self, scale: float, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
+    def test_depths_beyond_the_range_of_squares_are_as_in_torch(self, scale: float, monkeypatch) -> None:
         prior, (depth_sum, alpha) = prior_of(5, 20, 30), render_of(20, 30)
         native = loss_and_gradients((scale * depth_sum, alpha), prior)
         monkeypatch.setattr(module, "can_compare", lambda *parts: False)
@@ -325,9 +314,7 @@ class TestStiff:
         assert by_sum[0, [1, 9]].lt(0).all()
 
 
-def test_the_outline_of_a_sky_says_nothing_and_the_rim_of_the_image_is_no_outline(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_the_outline_of_a_sky_says_nothing_and_the_rim_of_the_image_is_no_outline(monkeypatch) -> None:
     monkeypatch.setattr(loading, "OUTLINE", 2)
     labels = torch.full((10, 12), int(Label.VERIFIED), dtype=torch.uint8)
     labels[:6] = int(Label.FAR)

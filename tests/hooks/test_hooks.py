@@ -1,7 +1,5 @@
 """The paper's equations as pure functions, insertion that covers what the prior knows, and the table of hooks."""
 
-from __future__ import annotations
-
 import math
 import os
 import re

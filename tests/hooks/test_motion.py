@@ -1,7 +1,5 @@
 """What moves: the image halfway between two instants supervises it, and it lives as long as its instant."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest
@@ -226,12 +224,10 @@ class Crossing:
         self.flicker, self.colors = flicker, colors
 
     def prior(self, camera: str, frame: int) -> DepthPrior:
-        """D* of any view."""
         labels = torch.full((HEIGHT, WIDTH), int(Label.VERIFIED), dtype=torch.uint8)
         return DepthPrior(torch.full((HEIGHT, WIDTH), DISTANCE), labels, self.image(frame) if self.colors else None)
 
     def image(self, frame: int) -> Tensor:
-        """uint8 [H, W, 3]."""
         grey = 100 + (self.flicker if frame % 2 else 0)
         image = torch.full((HEIGHT, WIDTH, 3), grey)
         image[:, BAR * frame : BAR * (frame + 1)] = 255

@@ -1,7 +1,5 @@
 """Parallax: what two cameras know is seen on the way from one to the other, unless something known hides it."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

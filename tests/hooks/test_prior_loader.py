@@ -1,7 +1,5 @@
 """Priors in memory: for which camera, as they are stored, no more than the setting allows, read ahead in a thread."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable
 from dataclasses import replace
@@ -69,9 +67,7 @@ def test_codes_say_what_the_maps_say(store: PriorStore) -> None:
         assert (known.near, known.far) == coded.known(view)[3:]
 
 
-def test_memory_holds_eight_bytes_a_pixel_and_the_log_says_when_it_is_full(
-    store: PriorStore, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_memory_holds_eight_bytes_a_pixel_and_the_log_says_when_it_is_full(store: PriorStore, caplog) -> None:
     caplog.set_level("INFO")
     loader = PriorLoader(store)
     loader.keep_bytes = 3 * 8 * HEIGHT * WIDTH

@@ -1,7 +1,5 @@
 """Pruning: the paper's scores, written out, what standing in free space adds, and how much may go at once."""
 
-from __future__ import annotations
-
 import logging
 from dataclasses import replace
 from types import SimpleNamespace
@@ -319,9 +317,7 @@ def hooks_that_remove(masks: dict[str, torch.Tensor], **settings: float) -> tupl
 @pytest.mark.parametrize(
     ("settings", "gone", "kept"), [({}, 36, slice(9, None, 10)), ({"remove_at_most": 0.5}, 20, slice(1, None, 2))]
 )
-def test_whatever_is_asked_for_some_stay_spread_over_the_rows_and_it_is_said(
-    settings: dict[str, float], gone: int, kept: slice, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_whatever_is_asked_for_some_stay_spread_over_the_rows_and_it_is_said(settings, gone, kept, caplog) -> None:
     d2, before = hooks_that_remove({"prune": torch.ones(40, dtype=torch.bool)}, **settings)
     with caplog.at_level(logging.WARNING):
         assert d2.step(1).removed == gone

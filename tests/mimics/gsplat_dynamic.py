@@ -93,8 +93,6 @@ def rasterization(params, item, state, hexplane, deform_net) -> tuple[Tensor, di
 
 
 class TwoStageScheduler:
-    """Which step comes when."""
-
     def __init__(self, coarse_steps: int, fine_steps: int) -> None:
         self.steps = range(coarse_steps, fine_steps)
 

@@ -4,8 +4,6 @@ NumPy and the C library round logarithms and exponentials differently. All point
 what does not hold is masked afterwards.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """Readers of what `d2 export` writes, as other programs read it: the oracles of its writers."""
 
-from __future__ import annotations
-
 import base64
 import gzip
 import json
@@ -46,7 +44,6 @@ class ReadPage:
 
     @property
     def coefficients(self) -> Tensor:
-        """Of the colours, [N, C, 3]."""
         parts = [self.arrays[name] for name in ("colors", "harmonics") if name in self.arrays]
         return torch.cat(parts, 1).unflatten(1, (-1, 3))
 
@@ -77,7 +74,6 @@ class ReadPage:
 
 
 def read_still_ply(path: Path) -> MovingGaussians:
-    """The Gaussians of a 3DGS PLY."""
     rows = read_ply(path)
     rest = columns(rows, "f_rest")
     rest = rest.unflatten(1, (3, rest.shape[1] // 3)).transpose(1, 2)

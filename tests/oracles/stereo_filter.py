@@ -1,7 +1,5 @@
 """The filter of geometric depth in NumPy: the bits that `d2_plugin.priors.stereo.filtering.kernel` must return."""
 
-from __future__ import annotations
-
 import itertools
 from typing import Any
 

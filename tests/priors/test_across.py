@@ -1,7 +1,5 @@
 """Slopes from surfaces that maps share: right where anchors cannot tell them, nothing where maps do not belong."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -63,7 +61,6 @@ def shown(
 
 
 def anchored(view: Shown, geometric: np.ndarray) -> Shown:
-    """The view with other anchors."""
     geometric = geometric.astype(np.float32)
     alignment = align(view.mono, geometric, kind="relative", settings=ALIGN)
     return view._replace(geometric=geometric, alignment=alignment)
@@ -135,9 +132,7 @@ def turned(name: str, mono: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("wrong", [noise, turned, lambda name, mono: mono.max() - mono])
-def test_maps_that_show_no_common_surface_are_told_nothing(
-    room: Recording, wrong: Callable[[str, np.ndarray], np.ndarray]
-) -> None:
+def test_maps_that_show_no_common_surface_are_told_nothing(room, wrong) -> None:
     views = shown(room, turned=wrong)
     assert not [view for view in aligned_across(views, "relative").values() if view.status is AlignStatus.ACROSS]
 

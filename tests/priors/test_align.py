@@ -1,7 +1,5 @@
 """Alignment of monocular depth: the line of least certified cost, what is refused, and stiff cases (43, 45)."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import example, given, settings
@@ -174,9 +172,7 @@ def test_at_the_boundary_the_scale_wants_to_be_negative_and_the_shift_is_best() 
     st.integers(2, 60), st.integers(0, 10**6), st.floats(0, 1), st.sampled_from([1e-6, 1e-3, 0.1, 1.0]), st.booleans()
 )
 @example(n=2, seed=1155, outliers=1.0, epsilon=1e-6, weighted=True)  # where the step to a feasible dual lost digits
-def test_the_gap_bounds_the_distance_to_every_other_line(
-    n: int, seed: int, outliers: float, epsilon: float, weighted: bool
-) -> None:
+def test_the_gap_bounds_the_distance_to_every_other_line(n, seed, outliers, epsilon, weighted) -> None:
     x, y = line(n, outliers, seed)
     rng = np.random.default_rng(seed)
     w = rng.uniform(0.1, 3, n) if weighted else np.ones(n)
@@ -268,9 +264,7 @@ ALSO_RIGHT = {
 
 @pytest.mark.parametrize("residual", ["absolute", "relative"])
 @pytest.mark.parametrize("name", CASES)
-def test_each_case_is_solved_to_its_certificate_and_used_or_refused_for_the_right_reason(
-    name: str, residual: str
-) -> None:
+def test_each_case_is_solved_to_its_certificate_and_used_or_refused_for_the_right_reason(name, residual) -> None:
     (x, y), expected = CASES[name]
     absolute = residual == "absolute"
     settings = AlignSettings(residual=residual, epsilon=0.01 if absolute else 0.02)

@@ -1,7 +1,5 @@
 """Scene flow and the instants halfway, in a recording of flat things whose truth halfway is drawn as well."""
 
-from __future__ import annotations
-
 import itertools
 from pathlib import Path
 from types import SimpleNamespace
@@ -39,7 +37,6 @@ def ball(column: float, row: float, radius: float = RADIUS) -> np.ndarray:
 
 
 def shown(*balls: np.ndarray) -> np.ndarray:
-    """The wall with orange balls in front."""
     image = wall()
     for mask in balls:
         image[mask] = (240, 150, 20)
@@ -150,9 +147,7 @@ class TestFlights:
 
 
 class TestHalfway:
-    def test_a_thrown_ball_is_on_its_parabola_with_its_depth_and_nothing_is_there_twice(
-        self, flown: PriorStore
-    ) -> None:
+    def test_a_thrown_ball_is_on_its_parabola_with_its_depth_and_nothing_is_there_twice(self, flown) -> None:
         for frame, quarter in itertools.product(range(4), QUARTERS):
             following, halfway = flown.underway("cam1", frame, quarter)
             assert following == frame + 1

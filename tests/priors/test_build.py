@@ -1,7 +1,5 @@
 """Building priors: what is verified is right, nothing is computed twice, and a kill loses the frame in work."""
 
-from __future__ import annotations
-
 import contextlib
 import importlib
 import importlib.util
@@ -19,6 +17,7 @@ import pytest
 import tiny_onnx
 import torch
 from prior_cases import contents, showing
+from refusals import refuses
 
 from d2_plugin.errors import D2Error, MissingExtra
 from d2_plugin.priors.build import PriorSummary, build_priors
@@ -117,9 +116,7 @@ def test_the_summary_and_the_record_say_what_was_built(built: tuple) -> None:
     assert "emulated" in record["monocular"]
 
 
-def test_training_cameras_alone_are_read_and_matched_within_their_timestamp(
-    plain: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_training_cameras_alone_are_read_and_matched_within_their_timestamp(plain, tmp_path, monkeypatch) -> None:
     """Neither held-out cameras nor true depth."""
     matched, reads = [], set()
 
@@ -142,9 +139,7 @@ def test_training_cameras_alone_are_read_and_matched_within_their_timestamp(
             np.testing.assert_array_equal(image, recording.image(camera, frame))
 
 
-def test_a_second_build_computes_nothing_and_changes_nothing(
-    plain: Recording, built: tuple, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_second_build_computes_nothing_and_changes_nothing(plain: Recording, built: tuple, monkeypatch) -> None:
     no_stereo(monkeypatch)
     before, seen = contents(built[0]), []
     progress = lambda done, total, note: seen.append((done, total))  # noqa: E731
@@ -180,9 +175,7 @@ def test_views_are_matched_again_where_a_setting_changed_that_matches_depend_on(
         ({"conflict_sigmas": 0.5, "most_vetoed": 1.0}, {"conflict_sigmas": 3.0, "most_vetoed": 1.0}),
     ],
 )
-def test_other_fusion_settings_reuse_the_stereo_cache(
-    plain: Recording, begun: Path, monkeypatch: pytest.MonkeyPatch, strict: dict, loose: dict
-) -> None:
+def test_other_fusion_settings_reuse_the_stereo_cache(plain, begun, monkeypatch, strict, loose) -> None:
     no_stereo(monkeypatch)
     strict = build_priors(plain, NAMES, begun, replace(SETTINGS, agreement=0.0, **strict))
     loose = build_priors(plain, NAMES, begun, replace(SETTINGS, agreement=0.0, **loose))
@@ -227,9 +220,7 @@ def test_a_refused_map_leaves_stereo_as_it_is(plain: Recording, begun: Path, tmp
     assert refused.record("train2", 0)["refused"] == NO_MAP
 
 
-def test_in_the_paper_a_refused_view_is_empty_with_its_reason_and_the_others_are_not(
-    plain: Recording, begun: Path
-) -> None:
+def test_in_the_paper_a_refused_view_is_empty_with_its_reason_and_the_others_are_not(plain, begun) -> None:
     summary = build_priors(lying(plain), NAMES, begun, PriorSettings.paper(stereo=SETTINGS.stereo))
     assert summary.built == 6
     refused = {(camera, frame) for camera, frame, _ in summary.refused}
@@ -268,14 +259,11 @@ def test_one_camera_has_mono_only_depth_from_a_metric_map(plain: Recording, tmp_
 
 
 def test_no_source_at_all_is_an_error(plain: Recording, tmp_path: Path) -> None:
-    with pytest.raises(D2Error, match="has no depth source"):
-        build_priors(replace(plain, mono_kind=None), NAMES[:1], tmp_path / "p", SETTINGS)
+    refuses("has no depth source", build_priors, replace(plain, mono_kind=None), NAMES[:1], tmp_path / "p", SETTINGS)
     assert not (tmp_path / "p").exists()
 
 
-def test_the_papers_preset_is_the_papers_equations_and_nothing_else(
-    plain: Recording, begun: Path, tmp_path: Path
-) -> None:
+def test_the_papers_preset_is_the_papers_equations_and_nothing_else(plain: Recording, begun: Path, tmp_path) -> None:
     """One line fitted to the anchors, e < tau_c, D^g where verified, the aligned map where alone, no evidence."""
     settings = PriorSettings.paper(stereo=SETTINGS.stereo)
     shutil.copytree(begun, tmp_path / "mvs")
@@ -305,9 +293,7 @@ def test_the_papers_preset_is_the_papers_equations_and_nothing_else(
     assert accepted
 
 
-def test_a_network_is_asked_once_per_image(
-    plain: Recording, begun: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_network_is_asked_once_per_image(plain: Recording, begun: Path, tmp_path: Path, monkeypatch) -> None:
     pytest.importorskip("onnxruntime")
     from d2_plugin.priors.monocular.network import MonocularModel
 
@@ -320,8 +306,7 @@ def test_a_network_is_asked_once_per_image(
     assert len(asked) == 6
     build_priors(plain, NAMES, begun, replace(settings, tau_c=0.3))
     assert len(asked) == 6
-    with pytest.raises(D2Error, match="mono_kind = relative"):
-        build_priors(plain, NAMES, tmp_path / "other", replace(settings, mono_kind=None))
+    refuses("mono_kind = relative", build_priors, plain, NAMES, tmp_path / "other", replace(settings, mono_kind=None))
 
 
 @pytest.mark.parametrize(
@@ -333,11 +318,8 @@ def test_a_network_is_asked_once_per_image(
         (NAMES, {"mono_kind": "metric"}, "declared relative"),
     ],
 )
-def test_mistakes_are_told_before_anything_is_written(
-    plain: Recording, tmp_path: Path, names: list[str], change: dict, message: str
-) -> None:
-    with pytest.raises(D2Error, match=message):
-        build_priors(plain, names, tmp_path / "p", replace(SETTINGS, **change))
+def test_mistakes_are_told_before_anything_is_written(plain, tmp_path, names, change, message) -> None:
+    refuses(message, build_priors, plain, names, tmp_path / "p", replace(SETTINGS, **change))
     assert not (tmp_path / "p" / "priors").exists()
 
 
@@ -388,9 +370,7 @@ def test_what_is_carried_over_is_not_matched_and_does_not_change_what_is_verifie
     assert np.median(carried) < 1.1 * np.median(matched)
 
 
-def test_a_build_that_stopped_within_a_block_goes_on_to_the_same_store(
-    still: Recording, still_built: Path, tmp_path: Path
-) -> None:
+def test_a_build_that_stopped_within_a_block_goes_on_to_the_same_store(still, still_built, tmp_path) -> None:
     class Stopped(Exception):
         pass
 
@@ -421,9 +401,7 @@ def cluster() -> Iterator[object]:
 
 
 @needs_dask
-def test_a_worker_killed_in_the_middle_changes_no_byte_of_the_store(
-    still: Recording, still_built: Path, cluster: object, tmp_path: Path
-) -> None:
+def test_a_worker_killed_in_the_middle_changes_no_byte_of_the_store(still, still_built, cluster, tmp_path) -> None:
     (worker,), killed, seen = cluster.workers.values(), [], []
 
     def kill(done: int, total: int, note: str) -> None:
@@ -457,8 +435,7 @@ def test_what_a_single_build_refuses_the_cluster_refuses_in_the_same_words(
     monkeypatch.setattr("distributed.Client", lambda at, timeout, **more: client(at, timeout="0.2s", **more))
     with pytest.raises(D2Error, match="no dask scheduler answers at tcp://127.0.0.1:1 "):
         build_priors_on_cluster(still, STILL_NAMES, tmp_path / "p", REUSE, scheduler="tcp://127.0.0.1:1")
-    with pytest.raises(D2Error, match="give at least 1"):
-        build_priors_on_cluster(still, STILL_NAMES, tmp_path / "p", REUSE, workers=0)
+    refuses("give at least 1", build_priors_on_cluster, still, STILL_NAMES, tmp_path / "p", REUSE, workers=0)
 
 
 def test_without_dask_its_extra_is_named(still: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,7 +1,5 @@
 """Sparse points from known poses: accurate, in two views too, and never a crash."""
 
-from __future__ import annotations
-
 import signal
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Declared against true error: the table is computed right, and sigma holds on recordings with true depth."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -136,7 +134,6 @@ def test_a_rounded_truth_is_told_by_its_steps_and_an_exact_one_is_not() -> None:
 def measured(recording: Recording, names: list[str], path: Path) -> DeclaredErrors:
     build_priors(recording, names, path, PriorSettings())
     found = held_against_truth(PriorStore.open(path), recording)
-    assert found is not None
     return found
 
 
@@ -149,9 +146,7 @@ def check(found: DeclaredErrors) -> None:
 
 
 @pytest.mark.parametrize("name", ["studio", "plaza"])
-def test_sigma_holds_on_a_recording_with_true_depth(
-    shared_data: Callable[[str], Path], tmp_path: Path, name: str
-) -> None:
+def test_sigma_holds_on_a_recording_with_true_depth(shared_data: Callable[[str], Path], tmp_path, name: str) -> None:
     recording = replace(open_recording(shared_data(name)), frames=(5,))
     found = measured(recording, TRAINING, tmp_path)
     check(found)

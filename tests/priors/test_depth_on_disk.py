@@ -1,7 +1,5 @@
 """Depth on disk: sensor maps, confidences and COLMAP workspaces become geometric depth in our units, or are refused."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -9,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from prior_cases import plane_seen_by, showing, write_dense_array
+from refusals import refuses
 
 from d2_plugin.errors import D2Error
 from d2_plugin.priors import depth_on_disk
@@ -137,8 +136,7 @@ def test_sensor_depth_comes_at_the_size_of_images_with_fewer_or_more_pixels_and_
 )
 def test_what_a_stored_number_means_must_be_declared(recording: Recording, description: object, message: str) -> None:
     write_sensor(recording, description)
-    with pytest.raises(D2Error, match=message):
-        find_depth_on_disk(recording, NAMES, SENSOR)
+    refuses(message, find_depth_on_disk, recording, NAMES, SENSOR)
 
 
 def test_a_map_that_is_no_depth_is_named(recording: Recording) -> None:
@@ -146,14 +144,11 @@ def test_a_map_that_is_no_depth_is_named(recording: Recording) -> None:
     camera, sensor = recording.cameras["train0"], SensorDepth(folder, NAMES)
     path = folder / "train0" / "00000.png"
     assert cv2.imwrite(str(path), np.zeros((90, 160), np.uint8))
-    with pytest.raises(D2Error, match=r"00000.png is uint8 .* 16 bits"):
-        sensor.depth(camera, 0)
+    refuses(r"00000.png is uint8 .* 16 bits", sensor.depth, camera, 0)
     path.write_bytes(b"")
-    with pytest.raises(D2Error, match="not a readable PNG"):
-        sensor.depth(camera, 0)
+    refuses("not a readable PNG", sensor.depth, camera, 0)
     assert cv2.imwrite(str(path), np.zeros((90, 90), np.uint16))
-    with pytest.raises(D2Error, match="90x90 but its image 160x90: register"):
-        sensor.depth(camera, 0)
+    refuses("90x90 but its image 160x90: register", sensor.depth, camera, 0)
 
 
 @pytest.mark.parametrize("noise", [0, 0.01])
@@ -194,9 +189,7 @@ def test_one_camera_with_a_depth_sensor_has_a_verified_prior(recording: Recordin
     assert record["bounds"] is None
 
 
-def test_depth_on_disk_is_read_again_where_it_or_its_confidence_changed_and_only_there(
-    recording: Recording, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_depth_on_disk_is_read_again_where_it_or_its_confidence_changed_and_only_there(recording, monkeypatch) -> None:
     folder, settings = write_sensor(recording, {"unit": "mm"}), PriorSettings(stereo=SENSOR)
     build_priors(recording, NAMES, recording.path / "priors", settings)
     filtered = []
@@ -235,8 +228,7 @@ def test_a_workspace_of_one_instant_is_not_the_depth_of_all(recording: Recording
     """Many recordings keep the workspace that their initial points come from."""
     write_maps(recording, "colmap", 0)
     assert find_depth_on_disk(recording, NAMES, AUTO) is None
-    with pytest.raises(D2Error, match="at frame 1: name images CAMERA/FRAME.png"):
-        workspace(recording).depth(recording.cameras["train0"], 1)
+    refuses("at frame 1: name images CAMERA/FRAME.png", workspace(recording).depth, recording.cameras["train0"], 1)
     write_maps(recording, "colmap/00000", 0)
     assert find_depth_on_disk(recording, NAMES, AUTO) is None
     write_maps(recording, "colmap/00001", 1)
@@ -296,13 +288,10 @@ def test_cameras_of_a_workspace_may_differ_by_a_bundle_adjustment_and_no_more(re
     moved = np.eye(4)
     moved[:3, 3] = 0.3, -0.2, 0.4
     assert scale(train1=turned(0.5)) == pytest.approx(1, abs=0.01)
-    with pytest.raises(D2Error, match="train0 and train1 are 3.0 degrees off"):
-        scale(train1=turned(3.0))
-    with pytest.raises(D2Error, match="another arrangement"):
-        scale(train1=moved)
+    refuses("train0 and train1 are 3.0 degrees off", scale, train1=turned(3.0))
+    refuses("another arrangement", scale, train1=moved)
     assert scale_of_world(cameras[:1], {"train0": cameras[0].T_camera_world}, Path("w")) == 1
-    with pytest.raises(D2Error, match="whose scale cannot be known"):
-        scale_of_world(cameras[:1], {"train0": np.eye(4)}, Path("w"))
+    refuses("whose scale cannot be known", scale_of_world, cameras[:1], {"train0": np.eye(4)}, Path("w"))
 
 
 @pytest.mark.parametrize(
@@ -312,13 +301,10 @@ def test_cameras_of_a_workspace_may_differ_by_a_bundle_adjustment_and_no_more(re
         ("cameras.txt", "PINHOLE", "OPENCV", " 0.1 0 0 0", "lens distortion: give the output of `colmap image_und"),
     ],
 )
-def test_a_workspace_of_other_images_or_lenses_is_refused(
-    still: Recording, file: str, text: str, other: str, more: str, message: str
-) -> None:
+def test_a_workspace_of_other_images_or_lenses_is_refused(still, file, text, other, more, message) -> None:
     path = write_maps(still, "colmap", 0) / "sparse" / file
     path.write_text("".join(f"{line}{more}\n" for line in path.read_text().replace(text, other).splitlines()))
-    with pytest.raises(D2Error, match=message):
-        workspace(still).depth(still.cameras["train0"], 0)
+    refuses(message, workspace(still).depth, still.cameras["train0"], 0)
 
 
 def test_a_workspace_that_saw_other_cameras_is_warned_of(still: Recording, caplog: pytest.LogCaptureFixture) -> None:
@@ -329,9 +315,7 @@ def test_a_workspace_that_saw_other_cameras_is_warned_of(still: Recording, caplo
     assert "saw train2.png as well" in caplog.text
 
 
-def test_priors_from_a_workspace_pass_the_filter_and_are_right_as_is_what_other_cameras_saw(
-    recording: Recording,
-) -> None:
+def test_priors_from_a_workspace_pass_the_filter_and_are_right_as_is_what_other_cameras_saw(recording) -> None:
     write_maps(recording, "colmap/00000", 0, 3.0)
     write_maps(recording, "colmap/00001", 1, 0.2)
     summary = build_priors(recording, NAMES, recording.path / "priors", PriorSettings(agreement=0.0))
@@ -361,8 +345,7 @@ def test_depth_that_is_asked_for_and_absent_is_told(recording: Recording, matche
 def test_braces_never_fill_the_memory_or_look_things_up(place: str, tmp_path: Path) -> None:
     camera = Camera("a", 8, 6, np.eye(3), np.eye(4))
     source = WorkspaceDepth(tmp_path, place, [camera], [0])
-    with pytest.raises(D2Error, match="braces around other than frame"):
-        source.has_maps(0)
+    refuses("braces around other than frame", source.has_maps, 0)
 
 
 ONE = "train0"
@@ -398,9 +381,7 @@ def prior_of(room: Recording, settings: PriorSettings | None = None) -> PriorSto
 
 
 @pytest.mark.parametrize("suffix", [".npy", ".png"])
-def test_a_sensor_is_as_sure_as_it_says_and_a_pixel_it_does_not_trust_is_no_depth(
-    one_sensor: Recording, suffix: str
-) -> None:
+def test_a_sensor_is_as_sure_as_it_says_and_a_pixel_it_does_not_trust_is_no_depth(one_sensor, suffix) -> None:
     before = prior_of(one_sensor).prior(ONE, 0)
     sure = np.ones((54, 96))
     sure[:, 30:60], sure[:, 60:] = 0.5, 0
@@ -419,8 +400,7 @@ def test_a_sensor_is_as_sure_as_it_says_and_a_pixel_it_does_not_trust_is_no_dept
 @pytest.mark.parametrize("wrong", [-0.1, 1.5, np.nan])
 def test_a_confidence_outside_of_0_to_1_is_refused_with_its_file(one_sensor: Recording, wrong: float) -> None:
     write_confidence(one_sensor, np.full((54, 96), wrong))
-    with pytest.raises(D2Error, match=r"depth_confidence.*00000.npy .*a confidence is in 0..1"):
-        prior_of(one_sensor)
+    refuses(r"depth_confidence.*00000.npy .*a confidence is in 0..1", prior_of, one_sensor)
 
 
 def test_distances_along_the_ray_become_planar_depth_once(one_sensor: Recording) -> None:

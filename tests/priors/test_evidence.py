@@ -1,7 +1,5 @@
 """Mono-only depth compared with other cameras: surfaces are taken, maps that meet agree, the rest stays as it is."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -44,7 +42,6 @@ def left_of(left: FusedPrior, right: FusedPrior) -> FusedPrior:
 
 
 def painted(prior: FusedPrior, color: int) -> FusedPrior:
-    """With an image of one grey value."""
     return replace(prior, colors=np.full((HEIGHT, WIDTH, 3), color, np.uint8))
 
 
@@ -72,9 +69,7 @@ def test_maps_that_differ_by_more_than_the_tolerance_do_not_and_both_are_less_su
 
 
 @pytest.mark.parametrize("factor", [0.96, 0.99, 1.0, 1.02, 1.05])
-def test_a_surface_that_another_camera_verified_is_taken_along_the_ray_and_is_no_stereo_of_its_own(
-    factor: float,
-) -> None:
+def test_a_surface_that_another_camera_verified_is_taken_along_the_ray_and_is_no_stereo_of_its_own(factor) -> None:
     truth, theirs = slanted("left"), slanted("right")
     compared = left_of(prior_of(truth * factor), prior_of(theirs, Label.VERIFIED, 0.001))
     met = compared.labels == Label.AGREED

@@ -1,7 +1,5 @@
 """The filter of stereo depth and its sigma: true depth passes where it is seen twice, wrong depth does not."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

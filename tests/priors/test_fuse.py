@@ -1,7 +1,5 @@
 """Fusion and the sky: which depth a pixel gets, with which label and sigma."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -9,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from refusals import refuses
 
-from d2_plugin.errors import D2Error
 from d2_plugin.priors.fuse import (
     VARIANTS,
     cross_source_discrepancy,
@@ -101,9 +99,7 @@ depths = arrays(np.float32, (4, 5), elements=st.one_of(st.just(0.0), st.floats(0
 
 
 @given(depths, depths, st.floats(0.01, 0.5), st.sampled_from(VARIANTS))
-def test_exactly_supported_pixels_have_a_depth_and_it_is_one_of_the_two(
-    mono: np.ndarray, geometric: np.ndarray, tau_c: float, variant: str
-) -> None:
+def test_exactly_supported_pixels_have_a_depth_and_it_is_one_of_the_two(mono, geometric, tau_c, variant) -> None:
     prior = fuse(mono, geometric, tau_c=tau_c, variant=variant)
     supported = np.isin(prior.labels, (Label.VERIFIED, Label.MONO))
     np.testing.assert_array_equal(supported, prior.depth > 0)
@@ -153,10 +149,8 @@ def test_a_match_that_no_view_confirms_counts_where_the_map_does_as_far_as_the_m
 
 
 def test_unknown_variants_and_unequal_sizes_are_refused() -> None:
-    with pytest.raises(D2Error, match="did you mean 'dual_unverified'"):
-        fuse(MONO, GEOMETRIC, tau_c=0.1, variant="dual_unverifed")
-    with pytest.raises(D2Error, match="bring both to one size"):
-        fuse(MONO[:, :2], GEOMETRIC, tau_c=0.1)
+    refuses("did you mean 'dual_unverified'", fuse, MONO, GEOMETRIC, tau_c=0.1, variant="dual_unverifed")
+    refuses("bring both to one size", fuse, MONO[:, :2], GEOMETRIC, tau_c=0.1)
 
 
 HEIGHT, WIDTH, HORIZON, WALL = 90, 160, 40, 10.0

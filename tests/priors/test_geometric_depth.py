@@ -1,7 +1,5 @@
 """Geometric depth of one instant: cameras and ranges, how good it is, and where it is empty or refused (case 44)."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -9,10 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from prior_cases import camera_at
+from refusals import refuses
 
 from benchmarks.stereo_rigs import textured_rig
-from d2_plugin.compiler import NoCompiler, find_compiler
-from d2_plugin.errors import D2Error
 from d2_plugin.priors.geometry import check_depth_range, check_views, pixel_grid, view_pair, viewing_rays
 from d2_plugin.priors.settings import StereoSettings
 from d2_plugin.priors.stereo.depth_range import depth_bounds
@@ -22,10 +19,7 @@ from d2_plugin.recordings.recording import Camera, Recording
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 
 pytest.importorskip("cv2")
-try:
-    find_compiler()
-except NoCompiler:
-    pytest.skip("there is no C++ compiler for patchmatch", allow_module_level=True)
+pytestmark = pytest.mark.usefixtures("compiler")
 
 
 SETTINGS = StereoSettings(matcher="patchmatch")
@@ -67,9 +61,7 @@ def test_half_resolution_comes_back_at_full_size() -> None:
     assert wrong < 0.03
 
 
-def test_half_the_size_fills_what_the_full_size_leaves_empty(
-    pair: Recording, matched: list[GeometricDepth], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_half_the_size_fills_what_the_full_size_leaves_empty(pair, matched, monkeypatch) -> None:
     monkeypatch.setattr("d2_plugin.priors.stereo.geometric_depth.SCALES", (1,))
     full = run(pair, (2.0, 9.0))
     for camera, one, alone in zip(pair.cameras, matched, full):
@@ -79,7 +71,6 @@ def test_half_the_size_fills_what_the_full_size_leaves_empty(
         assert filled.sum() > 0.02 * known.sum()
         assert one.record["survivors"]["filled"] == np.count_nonzero(one.depth)
         truth = pair.depth(camera, 0)
-        assert truth is not None
         errors = np.abs(one.depth[filled] / truth[filled] - 1)
         assert np.median(errors) < 0.01
         assert (errors < 2 * one.sigma[filled]).mean() > 0.75
@@ -157,8 +148,7 @@ def test_points_behind_the_camera_do_not_count_and_cameras_at_one_point_have_no_
     backwards = -5 * cameras[0].T_camera_world[2, :3]
     behind = cameras[0].centre + backwards + np.random.default_rng(0).normal(0, 0.1, (200, 3))
     assert "triangulated" not in depth_bounds(cameras, behind).origin
-    with pytest.raises(D2Error, match="stand at one point"):
-        depth_bounds([replace(cameras[0], near_far=None)] * 2)
+    refuses("stand at one point", depth_bounds, [replace(cameras[0], near_far=None)] * 2)
 
 
 BOUNDS = (2.0, 9.0)
@@ -218,9 +208,7 @@ def uneven(x: float = 0, turn: float = 0) -> Camera:
 
 @settings(max_examples=50, deadline=None)
 @given(st.floats(0, 63), st.floats(0, 47), st.floats(0.5, 50), st.floats(-1, 1), st.floats(-0.6, 0.6))
-def test_a_projection_agrees_with_world_points_and_half_pixel_centres(
-    u: float, v: float, depth: float, x: float, turn: float
-) -> None:
+def test_a_projection_agrees_with_world_points_and_half_pixel_centres(u, v, depth, x, turn) -> None:
     reference, source = uneven(), uneven(x, turn)
     at = view_pair(reference, source).project(np.array([u]), np.array([v]), np.array([depth]))
     # Index u has its centre at u + 0.5 in the recording's pixel coordinates.
@@ -235,18 +223,14 @@ def test_a_projection_agrees_with_world_points_and_half_pixel_centres(
 
 @pytest.mark.parametrize("bounds", [(5.0, 1.0), (0.0, 1.0), (-1.0, 1.0), (1.0, 1.0), (1.0, np.inf), (np.nan, 2.0)])
 def test_an_impossible_depth_range_is_refused(bounds: tuple[float, float]) -> None:
-    with pytest.raises(D2Error, match="0 < near < far"):
-        check_depth_range(bounds)
+    refuses("0 < near < far", check_depth_range, bounds)
 
 
 def test_images_that_do_not_belong_to_the_cameras_are_refused() -> None:
     image, pair = np.zeros((48, 64, 3), np.uint8), [uneven(), replace(uneven(1), name="b")]
-    with pytest.raises(D2Error, match="one image per camera"):
-        check_views([image], pair)
-    with pytest.raises(D2Error, match="at least 2 cameras"):
-        check_views([image], pair[:1])
-    with pytest.raises(D2Error, match="camera b is 32x24 pixels"):
-        check_views([image, image[::2, ::2]], pair)
+    refuses("one image per camera", check_views, [image], pair)
+    refuses("at least 2 cameras", check_views, [image], pair[:1])
+    refuses("camera b is 32x24 pixels", check_views, [image, image[::2, ::2]], pair)
 
 
 def test_the_ray_of_a_pixel_projects_back_to_it_even_where_the_axes_are_skewed() -> None:

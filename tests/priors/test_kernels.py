@@ -1,7 +1,5 @@
 """Every compiled kernel of the priors returns what its NumPy oracle does, for any number of threads."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +12,7 @@ from oracles import cross_view as cross_view_oracle
 from oracles import stereo_filter as oracle
 from prior_cases import camera_at, plane_seen_by
 
-from d2_plugin.compiler import NoCompiler, find_compiler
+from d2_plugin.compiler import NoCompiler
 from d2_plugin.errors import D2Error
 from d2_plugin.priors import build
 from d2_plugin.priors.evidence import with_evidence
@@ -29,10 +27,7 @@ from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.store.maps import FusedPrior
 
 pytest.importorskip("cv2")
-try:
-    find_compiler()
-except NoCompiler as error:
-    pytest.skip(str(error), allow_module_level=True)
+pytestmark = pytest.mark.usefixtures("compiler")
 
 SETTINGS = StereoSettings()
 TOLERANCE = 0.02
@@ -79,9 +74,7 @@ class TestStereoFilter:
         between=st.booleans(),
         seed=st.integers(0, 1000),
     )
-    def test_is_the_bits_of_the_oracle(
-        self, count: int, width: int, height: int, exponent: int, noise: float, between: bool, seed: int
-    ) -> None:
+    def test_is_the_bits_of_the_oracle(self, count, width, height, exponent, noise, between, seed) -> None:
         rig, chosen = (
             self.rig(count, width, height, 10.0**exponent, noise, seed),
             replace(SETTINGS, between_pixels=between),
@@ -164,9 +157,7 @@ class TestPrecision:
         window=st.sampled_from([1, 3, 7, 9]),
         seed=st.integers(0, 1000),
     )
-    def test_is_the_bits_of_the_oracle(
-        self, width: int, height: int, exponent: int, noise: float, known: float, window: int, seed: int
-    ) -> None:
+    def test_is_the_bits_of_the_oracle(self, width, height, exponent, noise, known, window, seed) -> None:
         maps = self.maps(width, height, 10.0**exponent, noise, known, seed)
         for ours, theirs in zip(self.compiled(maps, window), self.expected(maps, window)):
             assert ours.dtype == theirs.dtype
@@ -230,9 +221,7 @@ class TestCrossView:
         colored=st.booleans(),
         seed=st.integers(0, 1000),
     )
-    def test_is_the_oracle(
-        self, sizes: list[tuple[int, int]], exponent: int, noise: float, colored: bool, seed: int
-    ) -> None:
+    def test_is_the_oracle(self, sizes, exponent, noise, colored, seed) -> None:
         rig = self.rig(sizes, 10.0**exponent, noise, colored, seed)
         self.assert_is_the_oracle(*rig, {"0": 2.0, "1": float("nan")})
 
@@ -251,9 +240,7 @@ class TestCrossView:
     )
     @pytest.mark.parametrize("turned", [0.0, np.pi / 2, np.pi])
     @pytest.mark.parametrize("principal", [(0.5, 0.5), (-2.0, 9.0)])
-    def test_is_the_oracle_wherever_the_other_camera_stands(
-        self, place: tuple[float, float, float], turned: float, principal: tuple[float, float]
-    ) -> None:
+    def test_is_the_oracle_wherever_the_other_camera_stands(self, place, turned, principal) -> None:
         priors, cameras = self.rig([(40, 30)] * 2, 1.0, 0.02, True, 3)
         cameras["0"] = camera_at(size=(40, 30))
         cameras["1"] = camera_at(place, turned, size=(40, 30), principal=principal)
@@ -269,9 +256,7 @@ class TestCrossView:
         same_for_any_threads(maps)
 
 
-def test_without_a_compiler_one_sentence_says_so_before_anything_is_built(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_a_compiler_one_sentence_says_so_before_anything_is_built(tmp_path: Path, monkeypatch) -> None:
     def none() -> None:
         raise NoCompiler("no C++ compiler found (looked for CXX, c++, g++, clang++): install g++ or clang++")
 

@@ -1,7 +1,5 @@
 """Monocular networks: sizes, preprocessing, what comes out, and what is refused."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable
 from dataclasses import replace
@@ -13,16 +11,11 @@ import tiny_onnx
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from refusals import refuses
 
-from d2_plugin.errors import D2Error, MissingExtra
+from d2_plugin.errors import MissingExtra
 from d2_plugin.priors.monocular.align import align, aligned_depth
-from d2_plugin.priors.monocular.network import (
-    IMAGENET_MEAN,
-    IMAGENET_STD,
-    MonocularModel,
-    external_weights,
-    upsample,
-)
+from d2_plugin.priors.monocular.network import IMAGENET_MEAN, IMAGENET_STD, MonocularModel, external_weights, upsample
 from d2_plugin.priors.settings import AlignSettings
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 
@@ -106,28 +99,21 @@ def test_the_fingerprint_changes_with_file_and_preprocessing(tmp_path: Path) -> 
 )
 def test_what_is_no_monocular_network_is_refused(tmp_path: Path, made: dict, given: dict, message: str) -> None:
     path = tiny_onnx.mean_network(tmp_path / "net.onnx", **({"height": 60, "width": 80} | made))
-    with pytest.raises(D2Error, match=message):
-        MonocularModel(path, **({"kind": "relative"} | given)).predict(IMAGE)
+    refuses(message, lambda: MonocularModel(path, **({"kind": "relative"} | given)).predict(IMAGE))
 
 
 def test_files_that_are_no_network_and_images_that_fill_the_memory_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(D2Error, match="no monocular network at"):
-        MonocularModel(tmp_path / "none.onnx", "relative")
+    refuses("no monocular network at", MonocularModel, tmp_path / "none.onnx", "relative")
     (tmp_path / "text.onnx").write_text("this is no network")
-    with pytest.raises(D2Error, match="is not an ONNX network that onnxruntime can run"):
-        MonocularModel(tmp_path / "text.onnx", "relative")
+    refuses("is not an ONNX network that onnxruntime can run", MonocularModel, tmp_path / "text.onnx", "relative")
     free = MonocularModel(tiny_onnx.mean_network(tmp_path / "free.onnx", "h", "w"), "relative")
-    with pytest.raises(D2Error, match="an image of 60000x10 would enter .* at most 8192 a side"):
-        free.input_size(10, 60_000)
+    refuses("an image of 60000x10 would enter .* at most 8192 a side", free.input_size, 10, 60_000)
 
 
-def test_a_missing_onnxruntime_is_told_with_the_command_that_mends_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_missing_onnxruntime_is_told_with_the_command_that_mends_it(tmp_path: Path, monkeypatch) -> None:
     path = tiny_onnx.mean_network(tmp_path / "net.onnx", 60, 80)
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
-    with pytest.raises(MissingExtra, match=r"pip install 'd2-4dgs\[mono\]'"):
-        MonocularModel(path, "relative")
+    refuses(r"pip install 'd2-4dgs\[mono\]'", MonocularModel, path, "relative", error=MissingExtra)
 
 
 def test_a_real_network_sees_the_nearer_thing_as_nearer(shared_data: Callable[[str], Path]) -> None:
@@ -147,8 +133,7 @@ def test_a_real_network_sees_the_nearer_thing_as_nearer(shared_data: Callable[[s
 def test_a_network_that_fails_on_a_image_names_itself(tmp_path: Path) -> None:
     model = MonocularModel(tiny_onnx.mean_network(tmp_path / "net.onnx", 32, 48), "relative")
     model.input = replace(model.input, height=16)  # as a file that does not keep what it says
-    with pytest.raises(D2Error, match=r"cannot read what .*net.onnx makes of an image of 48x16"):
-        model.predict(np.zeros((32, 48, 3), np.uint8))
+    refuses(r"cannot read what .*net.onnx makes of an image of 48x16", model.predict, np.zeros((32, 48, 3), np.uint8))
 
 
 @pytest.mark.parametrize("place", ["weights.bin", "below/weights.bin", "w" * 150])
@@ -169,9 +154,7 @@ def test_weights_that_lie_beside_the_network_belong_to_it(tmp_path: Path, place:
 
 
 @given(st.binary(max_size=60), st.integers(0, 4))
-def test_a_file_that_only_looks_like_a_network_names_no_weights(
-    tmp_path_factory: pytest.TempPathFactory, noise: bytes, copies: int
-) -> None:
+def test_a_file_that_only_looks_like_a_network_names_no_weights(tmp_path_factory, noise: bytes, copies: int) -> None:
     path = tmp_path_factory.getbasetemp() / "noise.onnx"
     path.write_bytes(noise + copies * (b"\x0a\x08location\x12" + noise) + b"end")
     assert external_weights(path) in ([], [path])

@@ -1,7 +1,5 @@
 """PatchMatch: as good as was promised, the same on every machine and thread, and never a map out of nothing."""
 
-from __future__ import annotations
-
 import platform
 from collections.abc import Callable
 from dataclasses import replace
@@ -13,7 +11,6 @@ from prior_cases import camera_at
 
 from benchmarks.stereo_measure import measure
 from benchmarks.stereo_rigs import Rig, load_rigs, textured_rig
-from d2_plugin.compiler import NoCompiler, find_compiler
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.geometry import index_intrinsics, pixel_grid, scaled_camera
 from d2_plugin.priors.settings import StereoSettings
@@ -25,10 +22,7 @@ from d2_plugin.priors.stereo.source_views import choose_sources
 from d2_plugin.recordings.recording import Camera
 
 pytest.importorskip("cv2")
-try:
-    find_compiler()
-except NoCompiler:
-    pytest.skip("there is no C++ compiler", allow_module_level=True)
+pytestmark = pytest.mark.usefixtures("compiler")
 
 SETTINGS = StereoSettings()
 
@@ -216,9 +210,7 @@ def test_images_may_differ_in_size(rig: Rig) -> None:
 
 
 @pytest.mark.skipif(platform.machine() != "x86_64", reason="the oldest x86-64 is meant")
-def test_a_processor_without_wide_vectors_finds_the_same(
-    rig: Rig, native: Maps, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_processor_without_wide_vectors_finds_the_same(rig: Rig, native: Maps, monkeypatch) -> None:
     monkeypatch.setenv("D2_CXXFLAGS", "-march=x86-64")
     plain = raw(rig)
     assert share_within(plain, rig, 0.01) == pytest.approx(share_within(native, rig, 0.01), abs=0.02)

@@ -1,7 +1,5 @@
 """PatchMatch on the GPU: the same .cu source on the CPU (fibre shim) and, where there is one, on a GPU."""
 
-from __future__ import annotations
-
 import ctypes
 import functools
 from collections.abc import Sequence
@@ -176,9 +174,7 @@ def test_a_missing_gpu_is_one_sentence(rig: Rig, monkeypatch: pytest.MonkeyPatch
 
 
 @pytest.mark.parametrize("capability", [80, 90, 120])
-def test_nvrtc_compiles_the_kernels_without_a_toolkit(
-    capability: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_nvrtc_compiles_the_kernels_without_a_toolkit(capability: int, monkeypatch, tmp_path: Path) -> None:
     monkeypatch.setenv("D2_CACHE", str(tmp_path))
     try:
         binary = nvrtc.build("patchmatch", PROGRAM, flags_for(4), capability)
@@ -188,9 +184,7 @@ def test_nvrtc_compiles_the_kernels_without_a_toolkit(
     assert b"d2_patchmatch_update" in binary.code
 
 
-def test_as_many_sources_as_there_may_be_are_refused_by_number_of_pixels(
-    rig: Rig, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_as_many_sources_as_there_may_be_are_refused_by_number_of_pixels(rig: Rig, monkeypatch) -> None:
     """Places in all sources together are 32-bit integers."""
     monkeypatch.setattr(patchmatch_kernel, "MOST_PIXELS", 1000)
     with pytest.raises(D2Error, match="pixels together, at most 1000 are possible: lower max_pixels"):

@@ -1,7 +1,5 @@
 """The contact sheet: every view of the store, with its labels and shares."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

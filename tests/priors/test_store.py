@@ -1,7 +1,5 @@
 """The prior store: what comes out is what went in, damage is named, and it is whose it says."""
 
-from __future__ import annotations
-
 import json
 import math
 import shutil
@@ -13,8 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from prior_cases import contents
+from refusals import refuses
 
-from d2_plugin.errors import D2Error
 from d2_plugin.priors.build import PriorSettings, PriorSummary, build_priors
 from d2_plugin.priors.settings import StereoSettings
 from d2_plugin.protocol import Label
@@ -66,8 +64,7 @@ def test_depth_labels_sigma_and_colours_come_back(store: PriorStore) -> None:
 def test_a_view_that_was_not_built_is_none(store: PriorStore) -> None:
     assert store.prior("a", 3) is None
     assert store.record("b", 3) is None
-    with pytest.raises(D2Error, match="unknown camera of the prior store 'c'"):
-        store.prior("c", 0)
+    refuses("unknown camera of the prior store 'c'", store.prior, "c", 0)
 
 
 @given(st.floats(1e-3, 1e3), st.floats(1, 1e9), st.integers(0, 10**6))
@@ -116,12 +113,9 @@ def with_pixel(map_: str, value: float) -> FusedPrior:
         (replace(some_prior(), colors=None), "its colours none"),
     ],
 )
-def test_maps_that_are_no_prior_are_refused_and_change_nothing(
-    store: PriorStore, prior: FusedPrior, message: str
-) -> None:
+def test_maps_that_are_no_prior_are_refused_and_change_nothing(store, prior, message) -> None:
     before = contents(store.path)
-    with pytest.raises(D2Error, match=message):
-        store.write("a", 0, prior, {})
+    refuses(message, store.write, "a", 0, prior, {})
     assert contents(store.path) == before
 
 
@@ -140,8 +134,7 @@ def test_what_is_damaged_is_named_on_open(store: PriorStore, part: str, kept: in
     path.unlink()
     if kept is not None:
         path.write_bytes(whole[:kept])
-    with pytest.raises(D2Error, match=message):
-        PriorStore.open(store.path)
+    refuses(message, PriorStore.open, store.path)
     if part == ".json":
         assert not store.is_current("a", 0, "k")
 
@@ -150,8 +143,7 @@ def test_what_is_damaged_is_named_on_open(store: PriorStore, part: str, kept: in
 def test_what_is_damaged_can_be_read_around_while_it_is_built_again(store: PriorStore, part: str) -> None:
     path = array_file(store, "b").with_suffix(part)
     path.write_bytes(path.read_bytes()[:60])
-    with pytest.raises(D2Error, match="damaged"):
-        PriorStore.open(store.path)
+    refuses("damaged", PriorStore.open, store.path)
     with store.building(store.path):
         reader = PriorStore.open(store.path)
         assert reader.prior("b", 0) is None
@@ -172,18 +164,14 @@ def test_an_array_whose_record_was_not_written_yet_is_not_trusted(store: PriorSt
 
 
 def test_stores_of_other_recordings_formats_and_other_folders_are_refused(store: PriorStore, tmp_path: Path) -> None:
-    with pytest.raises(D2Error, match="holds the priors of test, not of other"):
-        PriorStore.create(store.path, ["a"], [0], {"recording": "other"})
-    with pytest.raises(D2Error, match="no depth priors at"):
-        PriorStore.open(tmp_path / "nowhere")
+    refuses("holds the priors of test, not of other", PriorStore.create, store.path, ["a"], [0], {"recording": "other"})
+    refuses("no depth priors at", PriorStore.open, tmp_path / "nowhere")
     described = json.loads((store.path / "store.json").read_text())
     (store.path / "store.json").write_text(json.dumps({**described, "format": 99}))
-    with pytest.raises(D2Error, match=f"has format 99 but this version reads format {FORMAT}: build the priors anew"):
-        PriorStore.open(store.path)
+    refuses(f"has format 99 but this version reads format {FORMAT}: build the priors anew", PriorStore.open, store.path)
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.txt").write_text("do not lose me")
-    with pytest.raises(D2Error, match="holds no prior store"):
-        PriorStore.create(tmp_path / "mine", ["a"], [0], {"recording": "test"})
+    refuses("holds no prior store", PriorStore.create, tmp_path / "mine", ["a"], [0], {"recording": "test"})
     assert [path.name for path in (tmp_path / "mine").iterdir()] == ["thesis.txt"]
 
 
@@ -240,8 +228,7 @@ def test_another_recording_of_the_same_name_changes_no_byte(recording: Recording
         "a size": lambda: room(width=48, height=27),
         "a rig": lambda: room(arc_degrees=30),
     }
-    with pytest.raises(D2Error, match=r"holds the priors of \S+, not of .*\(.*\): choose another output folder"):
-        built(others[other](), copied)
+    refuses(r"holds the priors of \S+, not of .*\(.*\): choose another output folder", built, others[other](), copied)
     assert contents(copied) == before
 
 
@@ -254,9 +241,7 @@ def test_a_new_name_and_another_order_of_the_cameras_change_no_file(recording: R
 
 
 @pytest.mark.parametrize("first", [NAMES, ["train0", "train2"]], ids=["fewer", "more"])
-def test_other_cameras_of_the_recording_are_added_and_nothing_is_removed(
-    recording: Recording, tmp_path: Path, first: list[str]
-) -> None:
+def test_other_cameras_of_the_recording_are_added_and_nothing_is_removed(recording, tmp_path, first) -> None:
     second = ["train0", "train2"] if first == NAMES else NAMES
     built(recording, tmp_path / "store", first)
     before = contents(tmp_path / "store")

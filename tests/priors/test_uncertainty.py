@@ -1,7 +1,5 @@
 """Monocular depth beyond its anchors: local correction, and the declared sigma, which holds or is infinite."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
@@ -180,9 +178,7 @@ STIFF: dict[str, Callable[[Scene], tuple[np.ndarray, np.ndarray]]] = {
 
 
 @pytest.mark.parametrize("stiff", STIFF.values(), ids=STIFF)
-def test_stiff_cases_give_a_standard_deviation_or_infinity_and_no_warning(
-    scenes: list[Scene], stiff: Callable[[Scene], tuple[np.ndarray, np.ndarray]]
-) -> None:
+def test_stiff_cases_give_a_standard_deviation_or_infinity_and_no_warning(scenes, stiff) -> None:
     aligned, anchors = (map_.astype(np.float32) for map_ in stiff(scenes[2]))
     found = monocular_uncertainty(aligned, anchors, SETTINGS)
     for sigma in (found.sigma, found.at_anchors):

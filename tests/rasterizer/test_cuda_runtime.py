@@ -1,7 +1,5 @@
 """NVRTC, its cache and the launcher: what happens to gpu.cu before it runs, without a GPU."""
 
-from __future__ import annotations
-
 import ctypes
 import warnings
 from collections.abc import Iterator
@@ -27,9 +25,7 @@ def compiler() -> Iterator[nvrtc.Nvrtc]:
 
 
 @pytest.mark.parametrize(("capability", "channels"), [(80, 3), (90, 3), (120, 3), (90, 1), (90, 40)])
-def test_nvrtc_compiles_the_kernels_without_a_toolkit(
-    compiler: nvrtc.Nvrtc, capability: int, channels: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_nvrtc_compiles_the_kernels_without_a_toolkit(compiler, capability, channels, monkeypatch, tmp_path) -> None:
     monkeypatch.setenv("D2_CACHE", str(tmp_path))
     code, architecture = cuda.binary_for(capability, channels)
     assert architecture == f"sm_{capability}"
@@ -38,9 +34,7 @@ def test_nvrtc_compiles_the_kernels_without_a_toolkit(
         assert kernel in code
 
 
-def test_the_cache_serves_what_it_has_and_rebuilds_what_is_damaged(
-    compiler: nvrtc.Nvrtc, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_the_cache_serves_what_it_has_and_rebuilds_what_is_damaged(compiler, monkeypatch, tmp_path) -> None:
     monkeypatch.setenv("D2_CACHE", str(tmp_path))
     first = cuda.binary_for(90, 3)
     (entry,) = tmp_path.iterdir()
@@ -57,9 +51,7 @@ def test_the_cache_serves_what_it_has_and_rebuilds_what_is_damaged(
     assert len(list(tmp_path.iterdir())) == 3
 
 
-def test_a_cache_that_cannot_be_written_only_costs_time(
-    compiler: nvrtc.Nvrtc, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_cache_that_cannot_be_written_only_costs_time(compiler: nvrtc.Nvrtc, monkeypatch, tmp_path, caplog) -> None:
     (tmp_path / "file").touch()
     monkeypatch.setenv("D2_CACHE", str(tmp_path / "file" / "below"))
     assert cuda.binary_for(90, 3).code.startswith(b"\x7fELF")
@@ -153,7 +145,6 @@ def test_a_launch_of_nothing_never_reaches_the_driver(shim_driver: ctypes.CDLL) 
 
 
 def empty_scene() -> tuple:
-    """Arguments of a frame without Gaussians."""
     means, covariances, opacities = torch.zeros(0, 3), torch.zeros(0, 6), torch.zeros(0)
     constants = [0.2, 0.3, 0.99, 1 / 255, 1e-4, 1.3, 0.0]
     return means, covariances, opacities, (torch.eye(4), torch.eye(3), 16, 16), constants, 0

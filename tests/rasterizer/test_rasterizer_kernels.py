@@ -3,8 +3,6 @@
 The GPU's run on the CPU (`shim`: the same .cu source and host code) and, where there is one, on a device (`cuda`).
 """
 
-from __future__ import annotations
-
 import functools
 import os
 import warnings
@@ -29,15 +27,11 @@ from splat_scenes import (
     use_shim,
 )
 
-from d2_plugin.compiler import NoCompiler, find_compiler
 from d2_plugin.errors import D2Error
 from d2_plugin.protocol import Label
 from d2_plugin.rasterizer import RasterSettings, Render, Splats, cuda, native, rasterize, reference, survey
 
-try:
-    find_compiler()
-except NoCompiler as error:
-    pytest.skip(str(error), allow_module_level=True)
+pytestmark = pytest.mark.usefixtures("compiler")
 
 NAMES = ("means", "covariances", "opacities", "colors", "background", "screen_offsets")
 REFERENCE = Path(torch.float64)
@@ -273,9 +267,7 @@ def test_more_pairs_than_slots_can_number_are_refused() -> None:
 
 
 @pytest.mark.cuda
-def test_on_a_device_its_kernels_draw_on_the_current_stream_and_a_prior_may_lie_on_the_cpu(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_on_a_device_its_kernels_draw_on_the_current_stream_and_a_prior_may_lie_on_the_cpu(monkeypatch) -> None:
     path = path_of("cuda", monkeypatch)
     monkeypatch.setattr(reference, "rasterize", None)
     monkeypatch.setattr(reference, "survey", None)

@@ -1,17 +1,15 @@
 """The torch rasterizer against the definition of splatting, its gradients, and space that must be free."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 
 import numpy as np
 import pytest
 import torch
+from refusals import refuses
 from splat_scenes import Path, Scene, brute_force, make_view, near_edge_of, prior_of, random_scene, single
 from torch.autograd import gradcheck
 
-from d2_plugin.errors import D2Error
 from d2_plugin.protocol import Label
 from d2_plugin.rasterizer import DepthPrior, RasterSettings, Splats, rasterize, reference, survey
 
@@ -132,8 +130,7 @@ def test_gradients_are_those_of_the_image(seed, settings) -> None:
 def test_what_does_not_fit_together_is_named(changes, message) -> None:
     of_scene = {name: value for name, value in changes.items() if name in Scene._fields}
     options = {name: value for name, value in changes.items() if name not in of_scene}
-    with pytest.raises(D2Error, match=message):
-        single()._replace(**of_scene).render(**options)
+    refuses(message, single()._replace(**of_scene).render, **options)
 
 
 @pytest.mark.parametrize(
@@ -149,18 +146,15 @@ def test_maps_that_do_not_fit_the_view_are_named(maps, message) -> None:
     scene, edge = single(), maps.get("near_edge")
     prior = DepthPrior(torch.ones(15, 15), torch.ones(15, 15, dtype=torch.uint8))
     prior = prior._replace(**{name: map_ for name, map_ in maps.items() if name != "near_edge"})
-    with pytest.raises(D2Error, match=message):
-        survey(scene.splats, scene.view, prior, near_edge=edge)
+    refuses(message, survey, scene.splats, scene.view, prior, near_edge=edge)
     if edge is not None:
-        with pytest.raises(D2Error, match=message):
-            scene.render(near_edge=edge)
+        refuses(message, scene.render, near_edge=edge)
 
 
 def test_skew_is_refused_on_every_path(path: Path) -> None:
     view = make_view(15, 15)
     view.K[0, 1] = 2.0
-    with pytest.raises(D2Error, match="skew"):
-        single()._replace(view=view).on(path).render()
+    refuses("skew", single()._replace(view=view).on(path).render)
 
 
 def everywhere(scene: Scene, value: float) -> torch.Tensor:

@@ -1,7 +1,5 @@
 """All kernels under AddressSanitizer, the GPU's in the fibre shim and in any order: no access outside of any array."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

@@ -167,9 +167,7 @@ def test_entry_points_are_found_in_the_shape_of_python_3_9(monkeypatch: pytest.M
     assert registry.names("d2_plugin.no_such_group") == []
 
 
-def test_the_command_line_says_which_python_it_needs(
-    refused: Callable[..., str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_command_line_says_which_python_it_needs(refused: Callable[..., str], monkeypatch) -> None:
     """`d2` is for the environment where priors are built; a trainer's may be older and needs the three lines alone."""
     monkeypatch.setattr(sys, "version_info", (3, 9, 2, "final", 0))
     assert "the commands need Python 3.11 or later, this is 3.9: run them in another environment" in refused("plan")

@@ -1,7 +1,5 @@
 """What a page prints goes into the file of the commit that it names: three lines and an import, each at its place."""
 
-from __future__ import annotations
-
 import json
 import re
 import zlib

@@ -1,15 +1,13 @@
 """Cameras by the name of a preset or a published protocol: nested, sound, explained, and never made up."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from refusals import refuses
 from stand_in_recordings import smooth_recording
 
 from d2_plugin.commands.cli import main
-from d2_plugin.errors import D2Error
 from d2_plugin.recordings import Recording, open_recording
 from d2_plugin.recordings.export.folder import save_recording
 from d2_plugin.recordings.presets import PROTOCOLS, RIGS, VIEWS, camera_split, resolve_cameras
@@ -62,8 +60,7 @@ def test_a_recording_of_five_cameras_has_a_preset(tmp_path: Path) -> None:
     assert notes
     assert resolve_cameras(path, ("preset:2",), ("cam00",))[1] == ("cam00",)
     assert resolve_cameras("nowhere", ("a", "b")) == (("a", "b"), None, ())
-    with pytest.raises(D2Error, match="mixes a preset with other names"):
-        resolve_cameras(path, ("preset:2", "cam00"))
+    refuses("mixes a preset with other names", resolve_cameras, path, ("preset:2", "cam00"))
 
 
 @pytest.mark.parametrize(
@@ -115,8 +112,7 @@ NO_PRESET = "is no camera preset: expected preset:2"
     ids=lambda one: one if isinstance(one, str) else "",
 )
 def test_what_fits_no_list_is_refused(recording: Recording, text: str, message: str) -> None:
-    with pytest.raises(D2Error, match=message):
-        camera_split(recording, text)
+    refuses(message, camera_split, recording, text)
 
 
 def test_results_carry_the_protocols_name(tmp_path: Path) -> None:

@@ -1,7 +1,5 @@
 """What is looked at before work begins: calibrations that contradict the images, exposures, empty images, memory."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import combinations
@@ -10,6 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from refusals import refuses
 
 from d2_plugin.errors import D2Error
 from d2_plugin.recordings import Recording, Source, open_recording, select_cameras
@@ -114,12 +113,10 @@ def test_too_little_memory_is_said_before_work_begins(room: Recording, monkeypat
     names = list(room.cameras)[:2]
     assert 7 < needed_bytes(large, names) / 2**30 < 9, "7.4 GiB were measured for two images of 8000x4500"
     monkeypatch.setattr(memory_module, "available_bytes", lambda: 4 << 30)
-    with pytest.raises(D2Error, match=r"2 cameras of 8000x4500 pixels need about 7\.\d GiB .* use --downscale 2"):
-        check_memory(large, names)
+    refuses(r"2 cameras of 8000x4500 pixels need about 7\.\d GiB .* use --downscale 2", check_memory, large, names)
     check_memory(room, names)
     monkeypatch.setattr(memory_module, "available_bytes", lambda: 1 << 20)
-    with pytest.raises(D2Error, match="a machine with more memory"):
-        check_memory(large, names)
+    refuses("a machine with more memory", check_memory, large, names)
     monkeypatch.setattr(memory_module, "available_bytes", lambda: None)
     check_memory(large, names)
 

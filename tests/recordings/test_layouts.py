@@ -1,15 +1,13 @@
 """Layouts are one table: a recording in each reads back, a reader or a writer is a function or two and one row."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
 import pytest
+from refusals import refuses
 from small_layouts import CLOUD, small_recording, write_layout
 from stand_in_recordings import refused, write_grey
 
-from d2_plugin.errors import D2Error
 from d2_plugin.recordings import LAYOUTS, Layout, Recording, open_recording
 from d2_plugin.recordings.assembly import assembled
 from d2_plugin.recordings.cameras.camera import CalibratedCamera, pinhole
@@ -47,22 +45,18 @@ def write_tiny(export: Export) -> Written:
     return export.written({camera.name: "only"})
 
 
-def test_a_reader_is_two_functions_and_a_row_and_an_export_one_function_and_a_row(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_reader_is_two_functions_and_a_row_and_an_export_one_function_and_a_row(tmp_path: Path, monkeypatch) -> None:
     (tmp_path / "focal.txt").write_text("20")
     for frame in (3, 4):
         write_grey(tmp_path / f"{frame}.png", frame, (8, 6))
-    with pytest.raises(D2Error, match="is no recording"):
-        open_recording(tmp_path)
+    refuses("is no recording", open_recording, tmp_path)
     monkeypatch.setitem(LAYOUTS, "tiny", Layout(is_tiny, open_tiny))
     for layout in (None, "tiny"):
         recording = open_recording(tmp_path, layout=layout, frames=[4], downscale=2)
         assert (recording.layout, recording.frames) == ("tiny", (4,))
         assert recording.cameras["only"].K[0, 0] == 10
         assert (recording.image("only", 4) == 4).all()
-    with pytest.raises(D2Error, match=r"of another layout \(.*colmap, tiny; see"):
-        open_recording(tmp_path.parent)
+    refuses(r"of another layout \(.*colmap, tiny; see", open_recording, tmp_path.parent)
     monkeypatch.setitem(WRITERS, "tiny", write_tiny)
     original = synthetic_recording(cameras=1, frames=2, width=16, height=12)
     folder = export_recording(original, "tiny", tmp_path / "out")
@@ -86,8 +80,7 @@ def test_a_folder_of_several_layouts_is_read_as_the_first_of_them(tmp_path: Path
         "enerf",
         "transforms",
     ]
-    with pytest.raises(D2Error, match=r"cannot read .*poses_bounds\.npy|no cam\*\.mp4"):
-        open_recording(tmp_path)
+    refuses(r"cannot read .*poses_bounds\.npy|no cam\*\.mp4", open_recording, tmp_path)
 
 
 LENSES = ("technicolor", "enerf")

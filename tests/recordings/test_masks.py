@@ -1,7 +1,5 @@
 """Masks beside images: what is foreground, and what was recorded at all."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -56,7 +54,6 @@ def recorded_folder(path: Path, masks: str = "masks", valid: bool = False) -> Pa
 def test_masks_are_read_where_they_lie(folder: str, tmp_path: Path) -> None:
     recording = open_recording(recorded_folder(tmp_path / "recording", folder))
     mask = recording.mask("cam00", 0)
-    assert mask is not None
     np.testing.assert_array_equal(mask, left_half() / 255)
     assert recording.mask("cam00", 1) is None
     assert recording.mask("cam01", 0) is None
@@ -72,7 +69,6 @@ def test_a_mask_may_have_any_number_of_channels(channels: int, tmp_path: Path) -
         colors = np.dstack([np.full((H, W, 3), 90, np.uint8), grey])
     write_mask(path / "masks" / "cam00" / "0000.png", colors)
     mask = open_recording(path).mask("cam00", 0)
-    assert mask is not None
     np.testing.assert_array_equal(mask, grey / 255)
 
 
@@ -86,8 +82,6 @@ def test_a_mask_of_another_size_is_refused(tmp_path: Path) -> None:
 def test_masks_are_downscaled_and_saved_with_the_images(tmp_path: Path) -> None:
     recording = open_recording(recorded_folder(tmp_path / "recording", valid=True), downscale=2)
     mask, recorded = recording.mask("cam00", 0), recording.recorded("cam00")
-    assert mask is not None
-    assert recorded is not None
     assert (mask.shape, mask[:, : W // 4].min(), mask[:, W // 4 :].max()) == ((H // 2, W // 2), 1, 0)
     assert (recorded[: H // 2 - 3].all(), recorded[-3:].any()) == (True, False)  # half a block is not whole
     again = open_recording(save_recording(recording, tmp_path / "again"))
@@ -103,7 +97,6 @@ class TestUndistortion:
 
     def test_the_valid_region_is_where_a_white_image_stays_white(self) -> None:
         undone = Undistortion(self.CAMERA)
-        assert undone.valid is not None
         white = undone.image(np.full((H, W, 3), 255, np.uint8))
         assert (white[undone.valid] == 255).all()
         assert (white[0, 0] == 0).all()
@@ -117,8 +110,6 @@ class TestUndistortion:
         (path / "cameras.json").write_text(json.dumps(content))
         recording = open_recording(path)
         recorded, mask = recording.recorded("cam00"), recording.mask("cam00", 0)
-        assert recorded is not None
-        assert mask is not None
         assert recording.image("cam00", 0)[~recorded].mean() < 40
         assert recording.recorded("cam01") is None
         assert not np.array_equal(mask, left_half() / 255)  # it was bent with the image
@@ -167,13 +158,10 @@ def test_training_weighs_by_masks_and_never_by_what_was_not_recorded(tmp_path: P
     frames = TrainingFrames(recording, CAMERAS, background_weight=0.25)
     by_view = {(view.camera, view.frame): frames.weights(i) for i, view in enumerate(frames.views)}
     first, later = by_view["cam00", 0], by_view["cam00", 1]
-    assert first is not None
-    assert later is not None
     assert (first[0, 0], first[0, -1], first[-1, 0]) == (1, 0.25, 0)
     assert (later[0, -1], later[-1, 0]) == (1, 0)  # no mask: all of what was recorded counts
     assert by_view["cam01", 0] is None
     unweighted = TrainingFrames(recording, CAMERAS).weights(0)
-    assert unweighted is not None
     assert (unweighted[0, -1], unweighted[-1, 0]) == (1, 0)
 
 

@@ -1,7 +1,5 @@
 """COLMAP models, binary and text: cameras by name, lenses undone, what is refused and in which words."""
 
-from __future__ import annotations
-
 import zlib  # noqa: F401  before pycolmap, see d2_plugin.priors.colmap.points
 from pathlib import Path
 

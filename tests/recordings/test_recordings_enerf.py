@@ -1,7 +1,5 @@
 """ENeRF-Outdoor's layout: OpenCV's YAML, cameras that not every file knows, distortion undone on load."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

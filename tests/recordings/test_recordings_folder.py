@@ -1,7 +1,5 @@
 """The folder layout: what is read, what is refused and in which words."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil
@@ -9,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from refusals import refuses
 from stand_in_recordings import refused
 
-from d2_plugin.errors import D2Error
 from d2_plugin.recordings import open_recording
 from d2_plugin.recordings.export.folder import save_recording
 from d2_plugin.recordings.images import write_png
@@ -43,8 +41,7 @@ def edit_calibration(folder: Path, camera: int | None, **changes: object) -> Non
 
 
 def test_a_saved_recording_reads_back_bitwise_and_is_not_written_over(original: Recording, saved: Path) -> None:
-    with pytest.raises(D2Error, match="not empty.*nothing was written"):
-        save_recording(original, saved)
+    refuses("not empty.*nothing was written", save_recording, original, saved)
     found = open_recording(saved)
     assert (found.name, found.frames, found.fps) == ("scene", original.frames, original.fps)
     assert found.mono_kind == "relative"
@@ -64,8 +61,7 @@ def test_opening_reads_headers_only(folder: Path) -> None:
     for image in (folder / "images").rglob("*.png"):
         image.write_bytes(image.read_bytes()[:40])
     recording = open_recording(folder)
-    with pytest.raises(D2Error, match=r"00000\.png is not a readable PNG or JPEG"):
-        recording.image("train0", 0)
+    refuses(r"00000\.png is not a readable PNG or JPEG", recording.image, "train0", 0)
 
 
 def test_maps_are_declared_in_mono_json_and_optional(folder: Path) -> None:
@@ -83,9 +79,7 @@ def test_maps_are_declared_in_mono_json_and_optional(folder: Path) -> None:
     assert recording.mono("train0", 0) is None
 
 
-def test_depth_that_is_not_finite_counts_as_unknown_and_monocular_maps_keep_their_holes(
-    folder: Path, original: Recording
-) -> None:
+def test_depth_that_is_not_finite_counts_as_unknown_and_monocular_maps_keep_their_holes(folder, original) -> None:
     depth = original.depth("train0", 0).copy()
     depth[0, :3] = np.nan, np.inf, -1
     np.savez(folder / "depth" / "train0" / "00000.npz", depth=depth)
@@ -140,8 +134,7 @@ def test_images_that_fit_no_camera_or_frame_are_refused(folder: Path) -> None:
 def test_images_of_two_sizes_are_refused_when_read(folder: Path) -> None:
     write_png(folder / "images" / "train0" / "00001.png", np.zeros((12, 16, 3), np.uint8))
     recording = open_recording(folder)
-    with pytest.raises(D2Error, match="frame 1 of camera train0 is 16x12 pixels but its calibration says 32x24"):
-        recording.image("train0", 1)
+    refuses("frame 1 of camera train0 is 16x12 pixels but its calibration says 32x24", recording.image, "train0", 1)
 
 
 @pytest.mark.parametrize(

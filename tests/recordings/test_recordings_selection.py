@@ -1,7 +1,5 @@
 """Fewer cameras, frames and pixels; images in and out of files."""
 
-from __future__ import annotations
-
 import struct
 import sys
 from pathlib import Path
@@ -10,8 +8,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from refusals import refuses
 
-from d2_plugin.errors import D2Error, MissingExtra
+from d2_plugin.errors import MissingExtra
 from d2_plugin.recordings import open_recording, select_cameras, select_frames
 from d2_plugin.recordings.export.folder import save_recording
 from d2_plugin.recordings.images import image_size, read_image, shrink_depth, shrink_image, write_png
@@ -102,17 +101,13 @@ def test_a_downscaled_recording_projects_points_to_the_same_place() -> None:
     assert small.mono("train0", 0).shape == (38, 50)
     np.testing.assert_array_equal(small.image("train0", 0), shrink_image(recording.image("train0", 0), 4))
     assert downscale(recording, 1) is recording
-    with pytest.raises(D2Error, match="no whole number of at least 1"):
-        downscale(recording, 0)
+    refuses("no whole number of at least 1", downscale, recording, 0)
 
 
 def test_selections_are_checked() -> None:
     recording = synthetic_recording(frames=3, width=16, height=16)
     assert list(select_cameras(recording, ["test1", "train0"]).cameras) == ["test1", "train0"]
     assert select_frames(recording, [2, 0, 2]).frames == (0, 2)
-    with pytest.raises(D2Error, match="no camera chosen"):
-        select_cameras(recording, [])
-    with pytest.raises(D2Error, match="duplicate"):
-        select_cameras(recording, ["test0", "test0"])
-    with pytest.raises(D2Error, match="no frame chosen.*0 to 2"):
-        select_frames(recording, [])
+    refuses("no camera chosen", select_cameras, recording, [])
+    refuses("duplicate", select_cameras, recording, ["test0", "test0"])
+    refuses("no frame chosen.*0 to 2", select_frames, recording, [])

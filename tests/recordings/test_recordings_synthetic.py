@@ -1,7 +1,5 @@
 """The synthetic room: exact geometry, real-looking difficulty, the same every time."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The Technicolor layout: both releases, off-centre principal points, known damage, what is refused."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """transforms.json: NeRF axes, times, intrinsics beside each image, splits, transparent images."""
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Rigs whose lenses are not known, or whose cameras share a board alone; features in better places; d2 import."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Callable
@@ -11,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from recorded import Filmed, Shooting, video
+from refusals import refuses
 from rigs import arc, cv2, filmed, held, seen_by, worst
 from stand_in_recordings import smooth_recording
 
@@ -110,15 +109,13 @@ class TestBoards:
         blank = [np.full((480, 640, 3), 128, np.uint8)]
         with pytest.raises(D2Error, match=r"saw 0 sides .*c1 in 0 of 1 images.*: show the whole board"):
             scaled_by_board(rig, {"c0": half["c0"], "c1": blank, "c2": blank}, board)
-        with pytest.raises(D2Error, match="unknown marker dictionary 'DICT_9'"):
-            scaled_by_board(rig, half, replace(board, dictionary="DICT_9"))
+        refuses("unknown marker dictionary 'DICT_9'", scaled_by_board, rig, half, replace(board, dictionary="DICT_9"))
         with pytest.raises(D2Error, match="saw 0 sides of the board's squares .* show the whole board"):
             scaled_by_board(rig, half, replace(board, marker=None))
 
     def test_words_are_a_board_or_refused(self) -> None:
         for text in ("", "charuco:7x5:0.04", "charuco:7x5:0.03:0.04", "checkerboard:9x6:-1", "chess:9x6:0.1"):
-            with pytest.raises(D2Error, match="expected charuco:COLUMNSxROWS:SQUARE:MARKER"):
-                Board.parsed(text)
+            refuses("expected charuco:COLUMNSxROWS:SQUARE:MARKER", Board.parsed, text)
         assert Board.parsed("charuco:7x5:0.04:0.03:DICT_5X5_50") == Board(7, 5, 0.04, 0.03, "DICT_5X5_50")
         assert Board.parsed("checkerboard:9x6:0.025") == Board(9, 6, 0.025)
 
@@ -171,7 +168,7 @@ def soft(tmp_path_factory: pytest.TempPathFactory) -> Filmed:
 
 @pytest.mark.slow
 def test_videos_become_a_recording_without_a_calibration(
-    shared_data: Callable[[str], Path], tmp_path: Path, capsys
+    shared_data: Callable[[str], Path], tmp_path, capsys, answered
 ) -> None:
     large = open_recording(shared_data("plaza_large"))
     near = video(select_cameras(large, NEIGHBOURS), tmp_path / "near", {name: Shooting() for name in NEIGHBOURS})
@@ -179,8 +176,7 @@ def test_videos_become_a_recording_without_a_calibration(
     apart = float(np.linalg.norm(truth["02"].centre - truth["05"].centre))
     words = ["import", str(near.videos), "--output", str(tmp_path / "c"), "--offsets", "none", "--exposure", "false"]
     words += ["--scale", "0.25", "--distance", f"02,05,{apart}", "--intrinsics", str(near.calibration)]
-    assert main(words) == 0
-    said = capsys.readouterr().out
+    said = answered(*words)
     assert "camera 03: 0." in said
     assert f"scale: from the distance {apart:g} of 02 and 05" in said
     found = {camera.name: camera.pinhole() for camera in open_calibration(tmp_path / "c" / "calibration.json").cameras}
@@ -198,10 +194,9 @@ def test_videos_become_a_recording_without_a_calibration(
     assert (tmp_path / "c" / "calibration.json").read_bytes() == before
 
 
-def test_cameras_that_share_nothing_are_refused_and_nothing_is_left(soft: Filmed, tmp_path: Path, capsys) -> None:
+def test_cameras_that_share_nothing_are_refused_and_nothing_is_left(soft: Filmed, tmp_path: Path, refused) -> None:
     words = ["import", str(soft.videos), "--output", str(tmp_path / "c"), "--offsets", "none"]
-    assert main([*words, "--intrinsics", str(soft.calibration)]) == 2
-    said = capsys.readouterr().err
+    said = refused(*words, "--intrinsics", str(soft.calibration))
     assert "where camera 0" in said
     assert "add stills on the way between the cameras (at most 20 degrees apart)" in said
     assert not (tmp_path / "c").exists()

@@ -1,7 +1,5 @@
 """Metrics agree with the reference implementations they are named after."""
 
-from __future__ import annotations
-
 import doctest
 import importlib.util
 import logging
@@ -14,9 +12,9 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from refusals import refuses
 from torch import nn
 
-from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.photometric import ssim
 from d2_plugin.runs import metrics
 from d2_plugin.runs.lpips import find_lpips
@@ -76,8 +74,7 @@ def test_psnr_is_in_decibel_and_infinite_for_equal_images() -> None:
 def test_a_window_larger_than_the_image_is_refused(metric: Callable[..., float], size: int) -> None:
     assert math.isfinite(metric(torch.rand(size, size, 3), torch.rand(size, size, 3)))
     small = torch.rand(size - 1, 40, 3)
-    with pytest.raises(D2Error, match=f"40x{size - 1} pixels is smaller than the {size}x{size} window"):
-        metric(small, small)
+    refuses(f"40x{size - 1} pixels is smaller than the {size}x{size} window", metric, small, small)
 
 
 @pytest.mark.parametrize(
@@ -89,11 +86,8 @@ def test_a_window_larger_than_the_image_is_refused(metric: Callable[..., float],
         (metrics.flicker, ((4, 4, 3), (4, 4, 3), (8, 4, 3), (8, 4, 3)), "no two frames of one camera"),
     ],
 )
-def test_what_cannot_be_compared_is_refused(
-    metric: Callable[..., float], sizes: tuple[tuple[int, ...], ...], message: str
-) -> None:
-    with pytest.raises(D2Error, match=message):
-        metric(*map(torch.rand, sizes))
+def test_what_cannot_be_compared_is_refused(metric, sizes, message) -> None:
+    refuses(message, metric, *map(torch.rand, sizes))
 
 
 def test_flip_is_nvidias_own_and_without_its_package_it_is_not_measured(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -134,7 +128,6 @@ def test_leaving_depth_out_never_flatters(missing: float) -> None:
 
 @pytest.fixture(scope="module")
 def image() -> torch.Tensor:
-    """A smooth image between .2 and .8."""
     rows, columns = torch.meshgrid(torch.linspace(0, 6, 40), torch.linspace(0, 9, 50), indexing="ij")
     return 0.5 + 0.3 * torch.stack([torch.sin(columns), torch.cos(rows), torch.sin(rows + columns)], -1)
 
@@ -208,7 +201,6 @@ def test_the_distance_is_the_published_formula_on_images_in_0_to_1(tmp_path: Pat
     weights, before = write_weights(tmp_path, net), torch.get_rng_state()
     distance = find_lpips(net, tmp_path)
     assert torch.equal(torch.get_rng_state(), before)
-    assert distance is not None
     assert net in distance.variant
     a, b = torch.rand(2, 66, 66, 3, generator=torch.Generator().manual_seed(2))
     shift, scale = torch.tensor([-0.030, -0.088, -0.188]), torch.tensor([0.458, 0.448, 0.450])
@@ -222,8 +214,7 @@ def test_the_distance_is_the_published_formula_on_images_in_0_to_1(tmp_path: Pat
         unit = x / (x.square().sum(1, keepdim=True).sqrt() + 1e-10)
         total += nn.functional.conv2d((unit[:1] - unit[1:]) ** 2, weights[f"lin{i}.model.1.weight"]).mean().item()
     assert distance(a, b) == pytest.approx(total, rel=1e-5)
-    with pytest.raises(D2Error, match="at least 64x64 pixels"):
-        distance(a[:32], b[:32])
+    refuses("at least 64x64 pixels", distance, a[:32], b[:32])
 
 
 def test_without_weights_it_is_not_available_and_says_so_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -237,10 +228,7 @@ def test_without_weights_it_is_not_available_and_says_so_once(tmp_path: Path, ca
 def test_files_that_are_no_weights_are_refused(tmp_path: Path) -> None:
     write_weights(tmp_path)
     torch.save({"lin0.model.1.weight": torch.rand(1, 64, 1, 1)}, tmp_path / "alex.pth")
-    with pytest.raises(D2Error, match="do not fit LPIPS alex"):
-        find_lpips("alex", tmp_path)
+    refuses("do not fit LPIPS alex", find_lpips, "alex", tmp_path)
     (tmp_path / "alex.pth").write_bytes(b"nothing")
-    with pytest.raises(D2Error, match=r"cannot read LPIPS weights .*alex\.pth"):
-        find_lpips("alex", tmp_path)
-    with pytest.raises(D2Error, match="unknown LPIPS network 'squeeze'"):
-        find_lpips("squeeze", tmp_path)
+    refuses(r"cannot read LPIPS weights .*alex\.pth", find_lpips, "alex", tmp_path)
+    refuses("unknown LPIPS network 'squeeze'", find_lpips, "squeeze", tmp_path)

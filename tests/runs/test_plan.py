@@ -1,7 +1,5 @@
 """What a scene does not need is left out, with the measurement that says so."""
 
-from __future__ import annotations
-
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -9,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from prior_cases import showing
+from refusals import refuses
 
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.geometry import viewing_rays
@@ -78,8 +77,7 @@ def test_flow_is_built_where_the_run_is_long_enough_to_use_it_or_its_user_says_s
     )
     run = Run(settings, tmp_path / "run")
     assert any("[motion] brings it back" in note for note in run.scene.recording.notes) == (not built)
-    with pytest.raises(D2Error, match=f"between: {built}"):
-        run.prepare()
+    refuses(f"between: {built}", run.prepare)
 
 
 def test_no_motion_leaves_the_temporal_dimension_out() -> None:
@@ -210,8 +208,7 @@ def test_a_sensor_is_the_geometric_source_of_one_camera(moving, tmp_path: Path) 
     assert plan.as_dict()["sensor"] == {"use": True, "reason": "sensor depth of train0 in depth/"}
     assert [plan.uses(name) for name in ("stereo", "monocular", "verification")] == [False, True, True]
     assert plan.obeyed_by(PriorSettings()) == PriorSettings()
-    with pytest.raises(D2Error, match=r"the sensor is taken first: choose a matcher"):
-        plan.override(stereo=True)
+    refuses(r"the sensor is taken first: choose a matcher", plan.override, stereo=True)
 
 
 def test_a_sensor_beside_one_of_two_cameras_leaves_stereo(moving, tmp_path: Path) -> None:
@@ -250,9 +247,7 @@ def test_no_stereo_reaches_the_priors(moving, tmp_path: Path, monkeypatch: pytes
         ("pose2sim_single", "cam01 cam02 cam03 cam04", [0, 20, 40], True),
     ],
 )
-def test_real_recordings_keep_stereo_and_time_where_something_moves(
-    shared_data, name: str, cameras: str, frames: list[int] | None, moves: bool
-) -> None:
+def test_real_recordings_keep_stereo_and_time_where_something_moves(shared_data, name, cameras, frames, moves) -> None:
     plan = plan_scene(open_recording(shared_data(name), frames=frames), cameras.split(), None)
     assert plan.uses("stereo")
     assert plan.uses("temporal") == moves

@@ -1,7 +1,5 @@
 """`d2 report`: made from rows and run folders alone, the same every time, and it says where its figures come from."""
 
-from __future__ import annotations
-
 import re
 import xml.etree.ElementTree as ET
 from pathlib import Path
@@ -10,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from refusals import refuses
 
 from benchmarks.rows import begin_rows
 from d2_plugin.durable import write_table
@@ -134,8 +133,7 @@ class TestGroups:
 
 
 def test_what_cannot_be_reported_is_one_sentence(tmp_path: Path) -> None:
-    with pytest.raises(D2Error, match="there is nothing to report"):
-        make_report([], tmp_path)
+    refuses("there is nothing to report", make_report, [], tmp_path)
     with pytest.raises(D2Error, match="rows of kind 'raster' are drawn from a checkout alone"):
         make_report([make_row("raster", "a", "b", error=None, seconds=None)], tmp_path)
 
@@ -175,10 +173,8 @@ def test_a_line_that_is_no_row_is_named(tmp_path: Path, line: str, message: str)
     path = tmp_path / "runs.jsonl"
     append_rows(path, [make_row("scaling", "room", "stereo", error=None, seconds=None)])
     path.write_text(path.read_text() + line + "\n")
-    with pytest.raises(D2Error, match=message):
-        read_rows([path])
-    with pytest.raises(D2Error, match="cannot read .*there is no such file"):
-        read_rows([tmp_path / "absent.jsonl"])
+    refuses(message, read_rows, [path])
+    refuses("cannot read .*there is no such file", read_rows, [tmp_path / "absent.jsonl"])
 
 
 def test_other_cameras_of_one_recording_are_another_case() -> None:
@@ -213,8 +209,7 @@ def test_folders_of_runs_are_searched_and_an_image_of_each_method_is_kept(tmp_pa
     assert [image.caption.split(":")[0] for image in images] == ["den, yang4d", "den, yang4d + D2"]
     page = make_report(rows, tmp_path / "report", images)[0].read_text()
     assert page.count("<img ") == 2
-    with pytest.raises(D2Error, match="no finished run lies in"):
-        collect([tmp_path / "report"])
+    refuses("no finished run lies in", collect, [tmp_path / "report"])
 
 
 @given(st.lists(st.floats(1e-16, 1e16), min_size=1, max_size=8), st.booleans())

@@ -1,9 +1,8 @@
 """What a run keeps: a damaged file is one sentence, a run that diverged stops, a second writer is refused."""
 
-from __future__ import annotations
-
 import io
 import math
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from refusals import refuses
 from tiny import ALL_HOOKS, make_model, make_trainer
 
 from d2_plugin.backbones import model
@@ -19,8 +19,6 @@ from d2_plugin.durable import write_archive, write_table
 from d2_plugin.errors import D2Error
 from d2_plugin.hooks.finite import Diverged
 from d2_plugin.locks import only_writer
-from d2_plugin.recordings.export.folder import save_recording
-from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.runs import run as run_module
 from d2_plugin.runs.evaluation import renderer
 from d2_plugin.runs.run import Run
@@ -32,9 +30,8 @@ pytest.importorskip("cv2")
 
 
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    recording = synthetic_recording(cameras=2, frames=2, width=48, height=27)
-    return save_recording(recording, tmp_path_factory.mktemp("scene") / "room")
+def scene(saved_room: Callable[..., Path]) -> Path:
+    return saved_room(cameras=2, frames=2, width=48, height=27)
 
 
 def bare(scene: Path, folder: Path, **changes: Any) -> Run:
@@ -73,20 +70,17 @@ class TestADamagedFile:
     @pytest.mark.parametrize("table", [{}, {"test": {}}, {"test": 3}, {"seconds": {"train": 1}}])
     def test_scores_of_another_shape_are_told(self, copied: Path, table: dict[str, Any]) -> None:
         write_table(copied / "metrics.json", table, METRICS)
-        with pytest.raises(D2Error, match=r"is damaged \(no .* in it\): run `d2 eval`"):
-            read_metrics(copied)
+        refuses(r"is damaged \(no .* in it\): run `d2 eval`", read_metrics, copied)
 
     def test_a_checkpoint_of_another_version_is_named(self, copied: Path) -> None:
         for state, found in (({"step": 4}, "None"), ({"format": 9}, "9")):
             written(copied / "checkpoint.pt", state)
-            with pytest.raises(D2Error, match=f"has format {found} but this version reads format 1"):
-                Run.load(copied).evaluate(images=False)
+            refuses(f"has format {found} but this version reads format 1", Run.load(copied).evaluate, images=False)
 
     @pytest.mark.parametrize("state", [{}, {"d2": None}, {"d2": 3, "step": "a"}, {"d2": None, "model": {}, "step": 1}])
     def test_a_checkpoint_of_another_shape_is_told(self, copied: Path, state: dict[str, Any]) -> None:
         save_checkpoint(copied / "checkpoint.pt", state)
-        with pytest.raises(D2Error, match="is not one of this run"):
-            Run.load(copied).evaluate(images=False)
+        refuses("is not one of this run", Run.load(copied).evaluate, images=False)
 
     def test_points_of_another_shape_version_or_with_nan_are_told(self, tmp_path: Path) -> None:
         path = tmp_path / "points.npz"
@@ -99,8 +93,7 @@ class TestADamagedFile:
             (zeros, "format None, expected 1", {}),
         ):
             written(path, {"positions": positions, "colors": zeros, "times": np.zeros(3), **form})
-            with pytest.raises(D2Error, match=reason):
-                TimedPoints.load(path)
+            refuses(reason, TimedPoints.load, path)
 
 
 class TestARunThatDiverges:
@@ -125,8 +118,7 @@ class TestARunThatDiverges:
             with watched(trainer, tmp_path / "checkpoint.pt") as check:
                 trainer.run(20, lambda step, loss: (check(step, loss), poison(step, loss)))
 
-        with pytest.raises(Diverged, match=rf"diverged at step 5 \(.* of \S+ is NaN or infinite\): .*{kept}"):
-            trained()
+        refuses(rf"diverged at step 5 \(.* of \S+ is NaN or infinite\): .*{kept}", trained, error=Diverged)
 
     def test_an_error_that_comes_of_it_is_reported_as_it(self, tmp_path: Path) -> None:
         def fails(trainer: SimpleNamespace, message: str) -> None:
@@ -140,13 +132,10 @@ class TestARunThatDiverges:
         with pytest.raises(Diverged, match="diverged at step 0 .*there is no checkpoint yet"):
             fails(trainer, "probability tensor contains nan")
 
-    def test_exits_with_one_sentence_and_is_not_saved(
-        self, scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-    ) -> None:
+    def test_exits_with_one_sentence_and_is_not_saved(self, scene: Path, tmp_path: Path, refused, monkeypatch) -> None:
         monkeypatch.setattr(model, "TIME_RATE", math.inf)
         words = ["train", str(scene), "--train-cameras", "train0,train1", "--hooks", "none", "--iterations", "20"]
-        assert main([*words, "--plan.temporal", "true", "--output", str(tmp_path / "run")]) == 2
-        told = capsys.readouterr().err.splitlines()[-1]
+        told = refused(*words, "--plan.temporal", "true", "--output", str(tmp_path / "run")).splitlines()[-1]
         assert told.startswith("d2: training diverged at step ")
         assert not (tmp_path / "run" / "metrics.json").exists()
         state = load_checkpoint(tmp_path / "run" / "checkpoint.pt", "cpu")
@@ -165,10 +154,8 @@ class TestOneWriter:
         run = bare(scene, tmp_path / "run")
         with only_writer(run.folder):
             for second in (bare(scene, tmp_path / "run"), Run.load(run.folder)):
-                with pytest.raises(D2Error, match="another process is writing .*: wait until it has ended"):
-                    second.train()
-                with pytest.raises(D2Error, match="another process is writing"):
-                    second.evaluate()
+                refuses("another process is writing .*: wait until it has ended", second.train)
+                refuses("another process is writing", second.evaluate)
         run.train()
         run.train()
 
@@ -189,9 +176,8 @@ class TestThePriorOfARun:
         assert "2 priors built, 0 kept\ncamera " in captured.out, "what the prior became is said before"
         assert not (tmp_path / "run" / "checkpoint.pt").exists()
 
-    def test_unless_it_is_asked_for(self, scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-        assert main(self.words(scene, tmp_path / "run", "--accept-empty-prior")) == 0
-        out = capsys.readouterr().out
+    def test_unless_it_is_asked_for(self, scene: Path, tmp_path: Path, answered) -> None:
+        out = answered(*self.words(scene, tmp_path / "run", "--accept-empty-prior"))
         last = out.splitlines()[-1]
         assert last.startswith("prior: 0 of 2 views are usable; none of camera train0; maps refused 2x ")
         prior = read_metrics(tmp_path / "run")["prior"]
@@ -215,8 +201,7 @@ def test_the_checkpoint_before_is_there_when_the_next_cannot_be_written_and_a_ru
 
     with monkeypatch.context() as patch:
         patch.setattr(run_module, "save_checkpoint", full)
-        with pytest.raises(D2Error, match="cannot write"):
-            run.train()
+        refuses("cannot write", run.train)
     assert load_checkpoint(run.folder / "checkpoint.pt", "cpu")["step"] == 3
     saved.clear()
     monkeypatch.setattr(run_module, "save_checkpoint", lambda path, state: saved.append(state["step"]))

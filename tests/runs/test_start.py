@@ -1,7 +1,5 @@
 """From a recording to views, images and the points that Gaussians start from."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -21,7 +19,6 @@ def recording():
 
 
 def surface_points(recording, count: int) -> np.ndarray:
-    """Points on the surfaces that train0 sees."""
     depth, camera = recording.depth("train0", 0), recording.cameras["train0"]
     in_camera = (viewing_rays(camera, np.float64) * depth[..., None]).reshape(-1, 3)
     in_camera = in_camera[np.linspace(0, depth.size - 1, count).astype(int)]

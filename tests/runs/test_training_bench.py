@@ -1,7 +1,5 @@
 """`d2 bench training`: equal CPU time, rows as they finish, reruns of what lacks; workers end with their parent."""
 
-from __future__ import annotations
-
 import math
 import os
 import signal
@@ -168,7 +166,6 @@ def test_a_busy_worker_ends_with_a_parent_that_is_killed(tmp_path: Path) -> None
     script = tmp_path / "parent.py"
     script.write_text(PARENT)
     with subprocess.Popen([sys.executable, str(script)], stdout=subprocess.PIPE, text=True) as parent:
-        assert parent.stdout is not None
         worker = int(parent.stdout.readline())
         assert runs(worker)
         parent.kill()

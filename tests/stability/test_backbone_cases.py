@@ -1,7 +1,5 @@
 """Stiff cases 18 to 41 of depth and of a training step with hooks: empty masks, numbers that leave their range."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -48,7 +46,6 @@ class Store:
         self.change = change
 
     def prior(self, camera: str, frame: int) -> DepthPrior:
-        """The changed prior of any view."""
         exact = TinyStore().prior(camera, frame)
         depth, labels = self.change(exact.depth.clone(), exact.labels.clone())
         return DepthPrior(depth, labels, exact.colors)
@@ -94,9 +91,7 @@ def assert_finite(model: SplatModel) -> None:
 
 
 @pytest.mark.parametrize("label", Label)
-def test_case_25_and_34_trusted_pixels_alone_supervise_and_judge_whatever_the_threshold(
-    model: SplatModel, label: Label
-) -> None:
+def test_case_25_and_34_trusted_pixels_alone_supervise_and_judge_whatever_the_threshold(model, label) -> None:
     trusted = label in (Label.VERIFIED, Label.AGREED)
     prune = PruneConfig(start=1, every=1, patience=1, tau_p=0.0, sight=False)
     config = replace(DEPTH_LOSS, prune=prune, views_per_evaluation=6)
@@ -201,9 +196,7 @@ def test_case_33_a_gaussian_that_no_view_sees_is_not_judged(model: SplatModel, s
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, 0.0])
-def test_case_36_an_empty_scene_is_filled_within_the_budget_from_depths_that_are_some(
-    model: SplatModel, bad: float
-) -> None:
+def test_case_36_an_empty_scene_is_filled_within_the_budget_from_depths_that_are_some(model, bad) -> None:
     model.select(torch.zeros(0, dtype=torch.int64))
     config = D2Config(
         densify=DensifyConfig(start=1, every=1, budget_per_view=20, max_gaussians=70), views_per_evaluation=6

@@ -1,7 +1,5 @@
 """Stiff and extreme Gaussians, numbered as in the list of cases that broke other codebases, on every path."""
 
-from __future__ import annotations
-
 import math
 
 import pytest
@@ -214,9 +212,7 @@ def test_case_18_nothing_to_draw_is_the_background(path: Path, count: int) -> No
 
 
 @pytest.mark.parametrize("channels", [3, 40])
-def test_case_20_a_loss_that_divides_by_zero_where_nothing_is_drawn_or_known_spoils_no_gradient(
-    path: Path, channels: int
-) -> None:
+def test_case_20_a_loss_that_divides_by_zero_where_nothing_is_drawn_or_known_spoils_no_gradient(path, channels) -> None:
     scene = single(size=41)._replace(colors=torch.rand(1, channels, dtype=torch.float64)).on(path).requires_grad()
     edge = near_edge_of(scene.view)
     render = scene.render(near_edge=edge)
@@ -291,9 +287,7 @@ def extreme_scene(seed: int, count: int) -> Scene:
 
 
 @pytest.mark.parametrize(("name", "seeds"), [("cpu", 60), ("shim", 4), ("torch", 3)])
-def test_case_41_thousands_of_extreme_gaussians_leave_everything_finite(
-    name: str, seeds: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_case_41_thousands_of_extreme_gaussians_leave_everything_finite(name: str, seeds: int, monkeypatch) -> None:
     path, drawn = path_of(name, monkeypatch), 0
     prior = DepthPrior(torch.rand(30, 40) + 0.5, torch.full((30, 40), 2, dtype=torch.uint8))
     for seed in range(seeds):

@@ -1,7 +1,5 @@
 """A recording small enough for hundreds of runs, and what was made of it without any mishap."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -30,7 +28,6 @@ class Work:
     begin: Callable[[], None]
 
     def anew(self) -> None:
-        """As before the first command."""
         shutil.rmtree(self.folder)
         self.folder.mkdir()
         self.begin()

@@ -1,7 +1,5 @@
 """Doors that a hostile or unlucky user found: one sentence each, in bounded time, and nothing of theirs is touched."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 import os
@@ -15,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from refusals import refuses
 from small_layouts import write_layout
 
 from d2_plugin.cache import Untrusted, cache_folder, check_private
@@ -72,8 +71,7 @@ def test_nothing_is_written_inside_the_images_of_a_recording(recording: Path, tm
         ):  # fmt: skip
             assert "where every folder is a camera" in refused(*words, "--output", place)
         assert "where every folder is a camera" in refused("compare", run, "--page", place / "deep.html")
-        with pytest.raises(D2Error, match="where every folder is a camera"):
-            PriorStore.create(place, ["a"], [0], {})
+        refuses("where every folder is a camera", PriorStore.create, place, ["a"], [0], {})
     assert {path: path.stat().st_mtime_ns for path in images.rglob("*")} == before
 
 
@@ -118,16 +116,13 @@ def test_a_sentence_that_repeats_a_damaged_file_is_short(tmp_path: Path) -> None
 
 def test_a_cache_that_cannot_be_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("D2_CACHE", "~no-user-of-this-name/x")
-    with pytest.raises(D2Error, match="there is no home folder of ~no-user"):
-        cache_folder()
+    refuses("there is no home folder of ~no-user", cache_folder)
     with pytest.raises(Untrusted, match="/dev/null is no folder: set D2_CACHE") as refusal:
         check_private(Path("/dev/null"))
     assert "delete" not in str(refusal.value)
 
 
-def test_links_in_a_circle_pipes_and_devices_are_one_sentence(
-    recording: Path, tmp_path: Path, refused: Refused
-) -> None:
+def test_links_in_a_circle_pipes_and_devices_are_one_sentence(recording: Path, tmp_path, refused: Refused) -> None:
     pytest.importorskip("av")
     (tmp_path / "videos").mkdir()
     loop, video = tmp_path / "loop", tmp_path / "videos" / "cam00.mp4"
@@ -202,9 +197,7 @@ def in_a_terminal() -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("in_a_terminal")
-def test_an_error_that_a_library_makes_of_ctrl_c_is_ctrl_c(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_error_that_a_library_makes_of_ctrl_c_is_ctrl_c(monkeypatch, capsys: pytest.CaptureFixture[str]) -> None:
     def answer(words: list[str]) -> str:
         try:
             signal.raise_signal(signal.SIGINT)
@@ -228,8 +221,7 @@ def test_a_database_of_colmap_that_cannot_be_written_is_one_sentence(monkeypatch
     monkeypatch.setattr(points, "_triangulated", full)
     room = synthetic_recording(cameras=2, held_out=0, frames=1, width=96, height=54, arc_degrees=15)
     images = [room.image(name, 0) for name in room.cameras]
-    with pytest.raises(D2Error, match="COLMAP cannot triangulate in .* TMPDIR"):
-        points.triangulate(images, list(room.cameras.values()))
+    refuses("COLMAP cannot triangulate in .* TMPDIR", points.triangulate, images, list(room.cameras.values()))
 
 
 WRONG: tuple[Any, ...] = (None, 5, 1.5, math.nan, True, b"x", "", "\0", "/nope", ["a", 5], {"a": 1}, object(), 10**30)
@@ -299,15 +291,13 @@ def test_what_is_no_path_recording_camera_frame_or_image(recording: Path) -> Non
     ],
 )
 def test_a_board_that_cannot_be(values: dict[str, Any], says: str) -> None:
-    with pytest.raises(D2Error, match=says):
-        Board(**values).corners(IMAGE)
+    refuses(says, lambda: Board(**values).corners(IMAGE))
 
 
 @pytest.mark.parametrize("image", [IMAGE.astype(float), IMAGE[..., 0], IMAGE[:0], np.zeros((4, 4, 4), np.uint8)])
 def test_what_is_no_image(image: np.ndarray, tmp_path: Path) -> None:
     pytest.importorskip("av")
-    with pytest.raises(D2Error, match=r"expected RGB uint8 \[H, W, 3\]"):
-        Board(7, 5, 0.04).corners(image)
+    refuses(r"expected RGB uint8 \[H, W, 3\]", Board(7, 5, 0.04).corners, image)
     with (
         pytest.raises(D2Error, match=r"expected RGB uint8 \[H, W, 3\]"),
         write_video(tmp_path / "a.mp4", "mp4", 24) as add,
@@ -322,7 +312,5 @@ def test_arguments_become_what_is_declared() -> None:
         return names, count, share, place
 
     assert call(["a"], np.int64(3), 1, "x") == (["a"], 3, 1.0, Path("x"))
-    with pytest.raises(D2Error, match=r"names of .*call must be .*, got 'abc'"):
-        call("abc")
-    with pytest.raises(D2Error, match=r"count of .*call must be a whole number, got 1.5"):
-        call(["a"], 1.5)
+    refuses(r"names of .*call must be .*, got 'abc'", call, "abc")
+    refuses(r"count of .*call must be a whole number, got 1.5", call, ["a"], 1.5)

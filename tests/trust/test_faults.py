@@ -1,7 +1,5 @@
 """A disk that fails, kill -9 at any moment, a day of runs on one store: the same command again ends as undisturbed."""
 
-from __future__ import annotations
-
 import errno
 import random
 import shutil
@@ -174,7 +172,6 @@ class Day:
         return [*self.place.work["priors"].words, "--train-cameras", cameras, "--output", str(self.store)]
 
     def live(self) -> None:
-        """Until every run is finished."""
         running: dict[Started, int] = {}
         while self.open or running:
             while len(running) < AT_ONCE and (self.open or not running):

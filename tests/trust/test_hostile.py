@@ -1,7 +1,5 @@
 """A hostile user on the command line: each case is one sentence and exit code 2, never silence or a traceback."""
 
-from __future__ import annotations
-
 import os
 import shutil
 from collections.abc import Callable

@@ -58,7 +58,6 @@ class Page:
             self.requests.append(url)
 
     def open(self, address: str | Path) -> Page:
-        """Go to a file or an address."""
         self.page.goto(address.as_uri() if isinstance(address, Path) else address, wait_until="load")
         return self
 

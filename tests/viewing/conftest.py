@@ -1,13 +1,10 @@
 """A small run with all hooks, trained once for the tests of this folder."""
 
-from __future__ import annotations
-
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from d2_plugin.recordings.export.folder import save_recording
-from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.runs.run import Run
 from d2_plugin.runs.settings import RunSettings
 from d2_plugin.viewing.viewed import ViewedRun, viewed_run
@@ -16,11 +13,9 @@ CAMERAS = ("train0", "train1", "train2")
 
 
 @pytest.fixture(scope="session")
-def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def room(saved_room: Callable[..., Path]) -> Path:
     """A recording of three cameras and a held-out one, four frames of 96x54 at 12 per second."""
-    pytest.importorskip("cv2", reason="opencv is in the `image` extra")
-    path = tmp_path_factory.mktemp("recording") / "room"
-    return save_recording(synthetic_recording(cameras=3, held_out=1, frames=4, width=96, height=54), path)
+    return saved_room(cameras=3, held_out=1, frames=4, width=96, height=54)
 
 
 @pytest.fixture(scope="session")
@@ -42,5 +37,4 @@ def bare(room: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def viewed(trained: Path) -> ViewedRun:
-    """The same run, opened."""
     return viewed_run(trained)

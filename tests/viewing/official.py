@@ -4,8 +4,6 @@ Weights are numbers that any program can make again (`filled`). The repositories
 the points below at time 0.3, and `DEFORMED` and `BENT` are what those returned.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Checkpoints of official trainers are shown as their own code draws them, and none of that code is run."""
 
-from __future__ import annotations
-
 import pickle
 from pathlib import Path
 from typing import Any
@@ -12,6 +10,7 @@ import torch
 from mimics import fudan, hust4d, spacetime, swift4d
 from mimics.inria import default_options
 from oracles.export_files import ReadPage
+from refusals import refuses
 from torch import Tensor
 from viewing import official
 
@@ -56,17 +55,14 @@ class TestTuples:
         return model
 
     @pytest.mark.parametrize("layout", [FUDAN, FOUR_C], ids=["fudan", "4C4D"])
-    def test_4d_gaussians_are_shown_as_their_adapter_slices_them(
-        self, room: Path, tmp_path: Path, layout: tuple[str, ...]
-    ) -> None:
+    def test_4d_gaussians_are_shown_as_their_adapter_slices_them(self, room, tmp_path, layout) -> None:
         model = self.checkpoint(tmp_path / "chkpnt30000.pth", layout)
         found = open_viewed(tmp_path / "chkpnt30000.pth", room, ["train0", "train1"])
         assert found.test_cameras == ("train2", "test0")
         view = seen(found, 0.1)
         assert torch.equal(render_view(found.backbone, view).color, render_view(FudanAdapter(model), view).color)
         assert found.note == "times are taken to be seconds since the first frame"
-        with pytest.raises(D2Error, match="name its recording with --recording"):
-            open_viewed(tmp_path / "chkpnt30000.pth")
+        refuses("name its recording with --recording", open_viewed, tmp_path / "chkpnt30000.pth")
 
     @pytest.mark.parametrize("layout", [STATIC, FOUR_C_STATIC], ids=["3DGS", "4C4D without time"])
     def test_without_time_they_stand_still(self, room: Path, tmp_path: Path, layout: tuple[str, ...]) -> None:
@@ -132,20 +128,15 @@ class TestDeformable3D:
         assert close(drawn.covariances[:3, [0, 3, 5]].sum(1), factors.square().sum((1, 2)), 1e-2)
         assert found.backbone.colors(seen(found, half), drawn).shape == (40, 3)
 
-    def test_d2_view_takes_the_folder_for_a_checkpoint_and_not_for_a_recording(
-        self, room: Path, tmp_path: Path
-    ) -> None:
+    def test_d2_view_takes_the_folder_for_a_checkpoint_and_not_for_a_recording(self, room: Path, tmp_path) -> None:
         self.output(tmp_path)
         assert len(viewed_at(ViewSettings(tmp_path, recording=room)).backbone) == 40
-        with pytest.raises(D2Error, match=r"point_cloud\.ply does not say where its cameras stood"):
-            viewed_at(ViewSettings(tmp_path))
+        refuses(r"point_cloud\.ply does not say where its cameras stood", viewed_at, ViewSettings(tmp_path))
         weights = tmp_path / "deform" / "iteration_40000" / "deform.pth"
         torch.save({"layer.weight": torch.zeros(3)}, weights)
-        with pytest.raises(D2Error, match=r"has no linear\.0\.weight: it is no network of Deformable-3D-Gaussians"):
-            open_viewed(tmp_path, room)
+        refuses(r"has no linear\.0\.weight: it is no network of Deformable-3D-Gaussians", open_viewed, tmp_path, room)
         weights.unlink()
-        with pytest.raises(D2Error, match="a point cloud of Deformable-3D-Gaussians moves by it, copy both"):
-            open_viewed(tmp_path, room)
+        refuses("a point cloud of Deformable-3D-Gaussians moves by it, copy both", open_viewed, tmp_path, room)
 
 
 class Test4DGaussians:
@@ -208,11 +199,9 @@ class Test4DGaussians:
 
     def test_without_its_options_or_with_unknown_ones_it_is_refused(self, room: Path, tmp_path: Path) -> None:
         self.output(tmp_path, static_mlp=True)
-        with pytest.raises(D2Error, match=r"was trained with static_mlp.*Viewer\(d2\)"):
-            open_viewed(tmp_path, room)
+        refuses(r"was trained with static_mlp.*Viewer\(d2\)", open_viewed, tmp_path, room)
         (tmp_path / "cfg_args").unlink()
-        with pytest.raises(D2Error, match="cfg_args is not there: it says how the trainer was set"):
-            open_viewed(tmp_path, room)
+        refuses("cfg_args is not there: it says how the trainer was set", open_viewed, tmp_path, room)
 
     def test_options_are_read_and_not_run(self, tmp_path: Path) -> None:
         path = tmp_path / "cfg_args"
@@ -220,8 +209,7 @@ class Test4DGaussians:
         assert read_options(path) == {"no_do": True, "name": "</script>"}
         assert not (tmp_path / "made").exists()
         path.write_text("no options")
-        with pytest.raises(D2Error, match="is no list of options"):
-            read_options(path)
+        refuses("is no list of options", read_options, path)
 
 
 def still(count: int) -> dict[str, object]:
@@ -283,8 +271,7 @@ class TestClouds:
         found = open_viewed(tmp_path, room)
         assert close(found.backbone.slice_at(seen(found, 0.1)).means, official.inria_columns(9, 2)["_xyz"])
         (tmp_path / "empty" / "point_cloud").mkdir(parents=True)
-        with pytest.raises(D2Error, match="has no iteration_N/point_cloud"):
-            open_viewed(tmp_path / "empty", room)
+        refuses("has no iteration_N/point_cloud", open_viewed, tmp_path / "empty", room)
 
 
 class Harm:
@@ -301,14 +288,11 @@ class TestRefused:
     @pytest.mark.parametrize(
         ("name", "trainer"), [("dynamic_point_cloud.ply", "Ex4DGS or CEM-4DGS"), ("FDHash.pth", "Swift4D")]
     )
-    def test_the_still_part_of_a_model_is_not_shown_as_the_whole(
-        self, room: Path, tmp_path: Path, name: str, trainer: str
-    ) -> None:
+    def test_the_still_part_of_a_model_is_not_shown_as_the_whole(self, room, tmp_path, name, trainer) -> None:
         place = tmp_path / "point_cloud" / "iteration_30000"
         official.write_inria_ply(place / "point_cloud.ply", official.inria_columns(9))
         (place / name).write_bytes(b"")
-        with pytest.raises(D2Error, match=rf"is of {trainer}, whose motion lies in {name}.*Viewer\(d2\)"):
-            open_viewed(tmp_path, room)
+        refuses(rf"is of {trainer}, whose motion lies in {name}.*Viewer\(d2\)", open_viewed, tmp_path, room)
 
     def test_no_code_in_a_file_is_run(self, room: Path, tmp_path: Path) -> None:
         torch.save(((Harm(tmp_path / "made"),), 1), tmp_path / "chkpnt1.pth")
@@ -316,26 +300,20 @@ class TestRefused:
         TestDeformable3D.output(tmp_path / "def")
         torch.save(Harm(tmp_path / "made"), tmp_path / "def" / "deform" / "iteration_40000" / "deform.pth")
         for path in (tmp_path / "chkpnt1.pth", tmp_path / "ckpt_1.pt", tmp_path / "def"):
-            with pytest.raises(D2Error, match="cannot be read as a checkpoint of tensors"):
-                open_viewed(path, room)
+            refuses("cannot be read as a checkpoint of tensors", open_viewed, path, room)
         assert not (tmp_path / "made").exists()
 
-    def test_a_file_that_is_no_checkpoint(self, room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def test_a_file_that_is_no_checkpoint(self, room: Path, tmp_path: Path, refused) -> None:
         path = tmp_path / "a.pth"
         path.write_bytes(b"nothing")
-        with pytest.raises(D2Error, match="cannot be read as a checkpoint"):
-            open_viewed(path, room)
+        refuses("cannot be read as a checkpoint", open_viewed, path, room)
         torch.save({"weights": torch.zeros(3)}, path)
-        with pytest.raises(D2Error, match="is no checkpoint that can be shown"):
-            open_viewed(path, room)
+        refuses("is no checkpoint that can be shown", open_viewed, path, room)
         torch.save((tuple(range(40)), 1), path)
-        with pytest.raises(D2Error, match=r"has 40 entries, expected 19 \(fudan\), 21 \(4C4D\).*Viewer\(d2\)"):
-            open_viewed(path, room)
+        refuses(r"has 40 entries, expected 19 \(fudan\), 21 \(4C4D\).*Viewer\(d2\)", open_viewed, path, room)
         (tmp_path / "a.ply").write_bytes(b"ply\nformat binary_little_endian 1.0\nelement vertex -1\nend_header\n")
-        with pytest.raises(D2Error, match="it says -1 vertices"):
-            open_viewed(tmp_path / "a.ply", room)
-        assert main(["render", str(path), "--recording", str(room)]) == 2
-        assert capsys.readouterr().err.count("\n") == 1
+        refuses("it says -1 vertices", open_viewed, tmp_path / "a.ply", room)
+        refused("render", path, "--recording", room)
 
     @pytest.mark.parametrize(
         ("name", "value", "said"),
@@ -346,9 +324,7 @@ class TestRefused:
             ("_xyz", torch.full((20, 3), torch.nan), "numbers that are not finite"),
         ],
     )
-    def test_a_checkpoint_whose_tensors_do_not_fit_is_one_sentence(
-        self, room: Path, tmp_path: Path, name: str, value: object, said: str
-    ) -> None:
+    def test_a_checkpoint_whose_tensors_do_not_fit_is_one_sentence(self, room, tmp_path, name, value, said) -> None:
         torch.save((tuple((still(20) | {name: value}).values()), 1), tmp_path / "a.pth")
         with pytest.raises(D2Error, match=said) as caught:
             open_viewed(tmp_path / "a.pth", room)
@@ -365,13 +341,10 @@ def furthest(page: ReadPage, true: Splats, time: float) -> Tensor:
 class TestExport:
     """`d2 export` of a checkpoint: straight lines exactly where it has them, baked key times where not."""
 
-    def test_4d_gaussians_become_the_same_straight_lines(
-        self, room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-    ) -> None:
+    def test_4d_gaussians_become_the_same_straight_lines(self, room: Path, tmp_path: Path, answered) -> None:
         path = tmp_path / "chkpnt30000.pth"
         model = TestTuples.checkpoint(path)
-        assert main(["export", str(path), "--recording", str(room), "--train-cameras", "train0,train1"]) == 0
-        said = capsys.readouterr().out
+        said = answered("export", str(path), "--recording", str(room), "--train-cameras", "train0,train1")
         assert "times are taken to be seconds since the first frame" in said
         assert "moves on a straight line and fades in time, exactly as it was trained" in said
         page = ReadPage(tmp_path / "export" / "scene.html")

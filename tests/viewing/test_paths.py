@@ -1,7 +1,5 @@
 """Camera paths: they begin and end where they say, look where the cameras look, and stay where the cameras saw."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -15,15 +13,7 @@ from d2_plugin.errors import D2Error
 from d2_plugin.recordings import Camera
 from d2_plugin.recordings.cameras.camera import look_at
 from d2_plugin.recordings.synthetic.room import synthetic_recording
-from d2_plugin.viewing.camera_paths import (
-    MARGIN,
-    Rig,
-    camera_path_text,
-    focus_of,
-    for_size,
-    orbit,
-    read_camera_path,
-)
+from d2_plugin.viewing.camera_paths import MARGIN, Rig, camera_path_text, focus_of, for_size, orbit, read_camera_path
 
 ARC = list(synthetic_recording(cameras=4, held_out=0, frames=1, width=96, height=54).cameras.values())
 

@@ -1,7 +1,5 @@
 """Videos of a run: every image at its rate, along any path, of any kind, and nothing left where one fails."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Callable
@@ -11,10 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from command_lines import refused
+from refusals import refuses
 from viewing.export.scenes import psnr
 
-from d2_plugin.commands.cli import main
 from d2_plugin.durable import write_table
 from d2_plugin.errors import D2Error, MissingExtra
 from d2_plugin.recordings.images import read_image
@@ -48,9 +45,7 @@ def rendered(trained: Path) -> Callable[[str, int], np.ndarray]:
     return at
 
 
-def test_a_held_out_camera_plays_the_whole_recording_as_the_rasterizer_draws_it(
-    trained: Path, tmp_path: Path, rendered: Callable[[str, int], np.ndarray]
-) -> None:
+def test_a_held_out_camera_plays_the_whole_recording_as_the_rasterizer_draws_it(trained, tmp_path, rendered) -> None:
     said = run(RenderSettings((trained,), output=tmp_path / "a.mp4", quality=10))
     assert "4 images of 96x54, 12 per second" in said
     found = video_of(tmp_path / "a.mp4")
@@ -69,9 +64,7 @@ def test_an_orbit_has_the_asked_length_rate_and_odd_size(trained: Path, tmp_path
         assert (stream.width, stream.height, stream.frames, stream.average_rate) == (64, 36, 10, 20)
 
 
-def test_a_camera_path_of_nerfstudio_is_followed(
-    trained: Path, tmp_path: Path, viewed: ViewedRun, rendered: Callable[[str, int], np.ndarray]
-) -> None:
+def test_a_camera_path_of_nerfstudio_is_followed(trained, tmp_path, viewed, rendered) -> None:
     camera = viewed.recording.cameras["train1"]
     opengl = np.linalg.inv(camera.T_camera_world) @ np.diag([1.0, -1, -1, 1])
     fov = float(np.degrees(2 * np.arctan(camera.height / 2 / camera.K[1, 1])))
@@ -97,19 +90,15 @@ def test_time_plays_bounces_slows_and_freezes(viewed: ViewedRun) -> None:
     assert {*nearest} == {0, 1, 2, 3}
     assert max(abs(time - 0.5 * i) for i, time in enumerate(nearest)) <= 0.5
     assert len(times(path="training")) == 3 * 4
-    with pytest.raises(D2Error, match="lies outside the recording, which lasts 0.25 s"):
-        plan_video(viewed, RenderSettings((), at=3.0))
+    refuses("lies outside the recording, which lasts 0.25 s", plan_video, viewed, RenderSettings((), at=3.0))
 
 
 @pytest.mark.parametrize("settings", [{"seconds": 1e6}, {"speed": 1e-6}])
 def test_a_video_without_end_is_refused_before_it_is_laid_out(viewed: ViewedRun, settings: dict) -> None:
-    with pytest.raises(D2Error, match="images, at most 1000000: choose fewer --seconds"):
-        plan_video(viewed, RenderSettings((), **settings))
+    refuses("images, at most 1000000: choose fewer --seconds", plan_video, viewed, RenderSettings((), **settings))
 
 
-def test_images_that_memory_does_not_hold_are_refused(
-    trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_images_that_memory_does_not_hold_are_refused(trained: Path, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr("d2_plugin.recordings.checks.memory.available_bytes", lambda: 2**30)
     with pytest.raises(D2Error, match=r"images of 16384x9216 pixels need about 14.1 GiB .* smaller --width"):
         run(RenderSettings(runs=(trained,), output=tmp_path / "a.mp4", width=16384))
@@ -142,47 +131,44 @@ def test_panels_show_what_they_say(viewed: ViewedRun) -> None:
     assert depth.bar is not None
 
 
-def test_what_cannot_be_shown_is_one_sentence(
-    trained: Path, room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert "holds no run" in refused(capsys, "render", tmp_path)
-    assert "no run at" in refused(capsys, "render", tmp_path / "none")
-    assert "d2 render needs RUN" in refused(capsys, "render")
+def test_what_cannot_be_shown_is_one_sentence(trained: Path, room: Path, tmp_path: Path, refused) -> None:
+    assert "holds no run" in refused("render", tmp_path)
+    assert "no run at" in refused("render", tmp_path / "none")
+    assert "d2 render needs RUN" in refused("render")
     for more in (["--recording", room], ["--train-cameras", "train0"], ["--downscale", "2"]):
-        assert "is a folder of a run, which knows its recording" in refused(capsys, "render", trained, *more)
-    assert "did you mean 'orbit'?" in refused(capsys, "render", trained, "--path", "orbti")
-    assert "did you mean 'depth'?" in refused(capsys, "render", trained, "--show", "rgb,deph")
-    assert "did you mean 'test0'?" in refused(capsys, "render", trained, "--cameras", "test")
-    assert "at the recording's cameras only" in refused(capsys, "render", trained, "--path", "orbit", "--show", "error")
+        assert "is a folder of a run, which knows its recording" in refused("render", trained, *more)
+    assert "did you mean 'orbit'?" in refused("render", trained, "--path", "orbti")
+    assert "did you mean 'depth'?" in refused("render", trained, "--show", "rgb,deph")
+    assert "did you mean 'test0'?" in refused("render", trained, "--cameras", "test")
+    assert "at the recording's cameras only" in refused("render", trained, "--path", "orbit", "--show", "error")
 
 
 @pytest.mark.parametrize("command", ["render", "view", "export"])
 def test_a_run_of_which_nothing_is_left_or_known_is_one_sentence(
-    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str
+    trained: Path, tmp_path, refused, command: str
 ) -> None:
     folder = shutil.copytree(trained, tmp_path / "run")
     state = torch.load(folder / "checkpoint.pt", weights_only=True)
     parts = {name: {key: row[:0] for key, row in state["model"][name].items()} for name in ("parameters", "statistics")}
     state["model"] = parts | {"optimizer": state["model"]["optimizer"] | {"state": {}}}
     save_checkpoint(folder / "checkpoint.pt", state)
-    assert "has no Gaussian left at step 40" in refused(capsys, command, folder)
+    assert "has no Gaussian left at step 40" in refused(command, folder)
     (folder / "checkpoint.pt").unlink()
-    assert "holds no checkpoint yet" in refused(capsys, command, folder)
+    assert "holds no checkpoint yet" in refused(command, folder)
     table = json.loads((folder / "run.json").read_text())
     plain = {name: value for name, value in table.items() if name not in ("format", "seal")}
     write_table(folder / "run.json", plain | {"version": 99}, RUN)
-    assert "version 99" in refused(capsys, command, folder)
+    assert "version 99" in refused(command, folder)
 
 
 @pytest.mark.parametrize("command", ["render", "export"])
-def test_a_run_that_still_trains_and_has_no_prior_is_shown_with_a_note(
-    bare: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str
-) -> None:
+def test_a_run_that_still_trains_and_has_no_prior_is_shown_with_a_note(bare, tmp_path, answered, command) -> None:
     folder = shutil.copytree(bare, tmp_path / "<script>alert(1)<")
     state = torch.load(folder / "checkpoint.pt", weights_only=True)
     save_checkpoint(folder / "checkpoint.pt", state | {"step": 1})
-    assert main([command, str(folder), "--output", str(tmp_path / "out.mp4")]) == 0
-    assert f"{folder.name} still trains: this is step 1 of 2" in capsys.readouterr().out
+    assert f"{folder.name} still trains: this is step 1 of 2" in answered(
+        command, str(folder), "--output", str(tmp_path / "out.mp4")
+    )
 
 
 def soft(count: int, width: int, height: int) -> list[np.ndarray]:
@@ -242,8 +228,7 @@ def test_a_video_that_fails_leaves_what_was_there_and_nothing_else(tmp_path: Pat
         r"cannot write the video .*\.mp4 \(.*\): choose other --width": [np.zeros((2, 20_000, 3), np.uint8)],
     }
     for says, images in failures.items():
-        with pytest.raises(D2Error, match=says):
-            write(path, images)
+        refuses(says, write, path, images)
         assert path.read_bytes() == b"earlier"
         assert [entry.name for entry in tmp_path.iterdir()] == ["video.mp4"]
 
@@ -254,15 +239,12 @@ def test_a_place_where_no_video_can_be_is_one_sentence(tmp_path: Path) -> None:
     with pytest.raises(D2Error, match="a video of 100000 images per second cannot be: give --fps from 0.001 to 1000"):
         write(tmp_path / "a.mp4", soft(1, 32, 32), 1e5)
     for path in (tmp_path / "file" / "a.mp4", tmp_path / f"{'y' * 300}.mp4", tmp_path / "folder.mp4"):
-        with pytest.raises(D2Error, match="cannot write|is a file, expected a folder"):
-            write(path, soft(1, 32, 32))
-    with pytest.raises(D2Error, match="a video of format mp4 needs a name that ends so, got file"):
-        write(tmp_path / "file", soft(1, 32, 32))
+        refuses("cannot write|is a file, expected a folder", write, path, soft(1, 32, 32))
+    refuses("a video of format mp4 needs a name that ends so, got file", write, tmp_path / "file", soft(1, 32, 32))
     assert (tmp_path / "file").read_text() == "in the way"
     assert sorted(entry.name for entry in tmp_path.iterdir()) == ["file", "folder.mp4"]
 
 
 def test_without_pyav_one_sentence_says_how_to_get_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "av", None)
-    with pytest.raises(MissingExtra, match=r"pip install 'd2-4dgs\[video\]'"):
-        write(tmp_path / "a.mp4", [])
+    refuses(r"pip install 'd2-4dgs\[video\]'", write, tmp_path / "a.mp4", [], error=MissingExtra)

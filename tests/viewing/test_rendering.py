@@ -1,7 +1,5 @@
 """Looking: the same image as the backbone's own render."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """The viewer without a browser: training stays bitwise what it is, images keep to their share, names stay names."""
 
-from __future__ import annotations
-
 import copy
 import math
 from collections.abc import Callable
@@ -15,12 +13,10 @@ from urllib.request import urlopen
 import numpy as np
 import pytest
 import torch
-from command_lines import refused
 from tiny import ALL_HOOKS, make_trainer, parameters, same
 
-from d2_plugin.commands.cli import main
 from d2_plugin.config import D2Config
-from d2_plugin.errors import D2Error, MissingExtra
+from d2_plugin.errors import MissingExtra
 from d2_plugin.recordings.cameras.rotations import quaternion_of_rotation
 from d2_plugin.viewing.live import Viewer
 from d2_plugin.viewing.live.images import Resolution, draw
@@ -33,6 +29,7 @@ from d2_plugin.viewing.videos.plan import RenderSettings, plan_video
 from d2_plugin.viewing.viewed import ViewedRun
 
 pytest.importorskip("viser", reason="viser is in the `view` extra")
+from refusals import refuses
 from websockets.datastructures import Headers
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
@@ -77,7 +74,6 @@ def looker() -> Any:
 
 
 def built(viewed: ViewedRun, client: Any = None) -> Page:
-    """The page of a client, laid out."""
     page = Page(client or looker(), viewed, None, 54, lambda: None)
     page.build()
     return page
@@ -140,9 +136,7 @@ class TestWhoOnlyLooks:
         return sum(drawn) / clock.now
 
     @pytest.mark.parametrize("seconds", [0.001, 0.1])
-    def test_images_keep_to_their_share(
-        self, viewed: ViewedRun, monkeypatch: pytest.MonkeyPatch, seconds: float
-    ) -> None:
+    def test_images_keep_to_their_share(self, viewed: ViewedRun, monkeypatch, seconds: float) -> None:
         share = self.spent_on_images(viewed, monkeypatch, seconds, moves=False)
         assert 0.5 * WATCHED < share < 1.1 * WATCHED + seconds / (self.STEPS * self.SECONDS_OF_A_STEP)
 
@@ -320,9 +314,7 @@ def test_nothing_that_a_client_sends_stops_a_run_or_its_page(viewed: ViewedRun) 
         assert max(image.shape[0] for image in client.scene.images if image is not None) <= 720
 
 
-def test_a_page_that_fails_is_given_up_and_the_training_goes_on(
-    viewed: ViewedRun, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_page_that_fails_is_given_up_and_the_training_goes_on(viewed: ViewedRun, monkeypatch, caplog) -> None:
     monkeypatch.setattr("d2_plugin.viewing.live.viewer.draw", lambda *_: 1 / 0)
     with closing(Viewer(viewed=viewed, port=PORT, height=48, iterations=10)) as viewer:
         viewer._connected(looker())
@@ -368,12 +360,12 @@ class TestAccess:
 
 
 class TestSentences:
-    def test_what_cannot_be_shown(self, room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-        assert "is empty: give the folder of a run" in refused(capsys, "view", tmp_path)
-        assert "no such recording" in refused(capsys, "view", tmp_path / "none")
+    def test_what_cannot_be_shown(self, room: Path, tmp_path: Path, refused) -> None:
+        assert "is empty: give the folder of a run" in refused("view", tmp_path)
+        assert "no such recording" in refused("view", tmp_path / "none")
         (tmp_path / "store.json").write_text('{"format": 1}')
-        assert "lies in no folder of a run: name its recording" in refused(capsys, "view", tmp_path)
-        assert "has format 1 but this" in refused(capsys, "view", tmp_path, "--recording", room)
+        assert "lies in no folder of a run: name its recording" in refused("view", tmp_path)
+        assert "has format 1 but this" in refused("view", tmp_path, "--recording", room)
 
     def test_a_run_without_a_prior_has_no_points_to_show(self, bare: Path) -> None:
         found = viewed_at(ViewSettings(bare))
@@ -394,23 +386,17 @@ class TestSentences:
 
     @pytest.mark.parametrize("host", ["192.0.2.1", "no such host", "a" * 300, "\u200b.."])
     def test_an_address_that_is_not_ours(self, viewed: ViewedRun, host: str) -> None:
-        with pytest.raises(D2Error, match=r"nothing can listen at .*: give an address of this machine"):
-            Viewer(viewed=viewed, host=host)
+        refuses(r"nothing can listen at .*: give an address of this machine", Viewer, viewed=viewed, host=host)
 
     def test_nothing_to_show_and_no_viser(self, viewed: ViewedRun, monkeypatch: pytest.MonkeyPatch) -> None:
-        with pytest.raises(D2Error, match="needs something to show"):
-            Viewer()
+        refuses("needs something to show", Viewer)
         monkeypatch.setitem(__import__("sys").modules, "viser", None)
-        with pytest.raises(MissingExtra, match=r"pip install 'd2-4dgs\[view\]'"):
-            Viewer(viewed=viewed)
+        refuses(r"pip install 'd2-4dgs\[view\]'", Viewer, viewed=viewed, error=MissingExtra)
 
 
-def test_d2_train_says_where_to_watch_and_ends_where_nobody_looks(
-    room: Path, bare: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_d2_train_says_where_to_watch_and_ends_where_nobody_looks(room: Path, bare: Path, tmp_path, answered) -> None:
     words = ["train", str(room), "--train-cameras", "train0,train1", "--iterations", "2", "--hooks", "none", "--view"]
-    assert main([*words, "--output", str(tmp_path / "run")]) == 0
-    assert "watch it train at http://localhost:" in capsys.readouterr().out
+    assert "watch it train at http://localhost:" in answered(*words, "--output", str(tmp_path / "run"))
     ends = [torch.load(folder / "checkpoint.pt", weights_only=True)["model"] for folder in (tmp_path / "run", bare)]
     for name, value in ends[0]["parameters"].items():
         assert torch.equal(value, ends[1]["parameters"][name]), "a watched run is bitwise the one that is not"

@@ -1,7 +1,5 @@
 """The page in a real browser: it opens, a person moves camera and time, images change, two look at once."""
 
-from __future__ import annotations
-
 import socket
 import threading
 from collections.abc import Callable, Iterator
@@ -53,7 +51,6 @@ def opened(new_page: Callable[[], Page], viewer: Viewer) -> Page:
 
 
 def image(page: Page) -> np.ndarray:
-    """What the page shows, [H, W, 3]."""
     return decoded(page.page.screenshot(clip=FREE)).astype(float)
 
 
@@ -95,9 +92,7 @@ def control(page: Page, label: str) -> Any:
 
 
 @pytest.mark.slow
-def test_a_person_moves_camera_and_time_while_another_only_looks(
-    new_page: Callable[[], Page], viewed: ViewedRun
-) -> None:
+def test_a_person_moves_camera_and_time_while_another_only_looks(new_page, viewed) -> None:
     with showing(viewed) as viewer:
         one, two = opened(new_page, viewer), opened(new_page, viewer)
         first, other = settled(one), settled(two)

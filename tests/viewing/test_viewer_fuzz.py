@@ -1,7 +1,5 @@
 """The live viewer's socket, attacked: whatever a client sends, nothing is printed, others are served, nothing stops."""
 
-from __future__ import annotations
-
 import random
 from contextlib import closing, suppress
 from socket import SHUT_WR, create_connection
@@ -88,14 +86,7 @@ def test_only_what_the_page_sends_comes_in(viewed: ViewedRun, monkeypatch: pytes
 
 
 @pytest.mark.parametrize(("count", "seed"), [(FEW, 0), pytest.param(MANY, SEED, marks=pytest.mark.slow)])
-def test_messages_at_random(
-    viewed: ViewedRun,
-    count: int,
-    seed: int,
-    capfd: pytest.CaptureFixture[str],
-    caplog: pytest.LogCaptureFixture,
-    recwarn: pytest.WarningsRecorder,
-) -> None:
+def test_messages_at_random(viewed: ViewedRun, count: int, seed: int, capfd, caplog, recwarn) -> None:
     with showing(viewed) as viewer, connected(viewer) as looker:
         drawn(viewer, 1)
         for round in range(count // 50):
@@ -127,9 +118,7 @@ def test_messages_at_random(
     assert not [said for said in recwarn if "viser" in str(said.message)], "what a client sent is printed"
 
 
-def test_keyframes_come_and_go_while_the_path_is_asked_for(
-    viewed: ViewedRun, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_keyframes_come_and_go_while_the_path_is_asked_for(viewed: ViewedRun, capfd) -> None:
     with showing(viewed) as viewer, connected(viewer) as socket:
         drawn(viewer, 1)
         [(page, _)] = viewer._pages.values()

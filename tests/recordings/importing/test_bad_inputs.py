@@ -1,7 +1,5 @@
 """What people give by mistake: one sentence that says what to do, and nothing is written over."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil
@@ -59,7 +57,6 @@ def importing(given: Filmed, output: Path, *more: str) -> list[str]:
 
 
 def change(given: Filmed, edit: Callable[[dict[str, Any]], object]) -> None:
-    """Spoil the calibration."""
     table = json.loads(given.calibration.read_text())
     edit({camera["name"]: camera for camera in table["cameras"]})
     given.calibration.write_text(json.dumps(table))
@@ -109,7 +106,6 @@ def edited(edit: Callable[[dict[str, Any]], object]) -> Callable[[Filmed], None]
 
 
 def overwritten(name: str, content: bytes) -> Callable[[Filmed], object]:
-    """Writes something else into a file."""
     return lambda given: (given.folder / name).write_bytes(content)
 
 
@@ -158,9 +154,7 @@ CASES: list[tuple[Callable[[Filmed], object], list[str], str]] = [
 
 
 @pytest.mark.parametrize(("spoil", "words", "says"), CASES, ids=lambda one: getattr(one, "__name__", None))
-def test_one_sentence_and_nothing_written_over(
-    given: Filmed, tmp_path: Path, refused: Refused, spoil: Callable, words: list[str], says: str
-) -> None:
+def test_one_sentence_and_nothing_written_over(given, tmp_path, refused, spoil, words, says) -> None:
     spoil(given)
     before = {path: path.read_bytes() for path in given.folder.rglob("*") if path.is_file()}
     sentence = refused(*importing(given, tmp_path / "recording", *words))
@@ -169,9 +163,7 @@ def test_one_sentence_and_nothing_written_over(
     assert not (tmp_path / "recording" / "cameras.json").exists()
 
 
-def test_another_import_and_another_folder_are_not_written_over(
-    given: Filmed, tmp_path: Path, refused: Refused
-) -> None:
+def test_another_import_and_another_folder_are_not_written_over(given: Filmed, tmp_path, refused: Refused) -> None:
     folder, small = tmp_path / "recording", ("--scale", "0.3", "--offsets", "none", "--frames")
     assert "--frames asks for 500" in refused(*importing(given, folder, *small, "500"))
     assert main(importing(given, folder, *small, "0:4:2")) == 0, "what was refused leaves nothing in the way of advice"
@@ -221,9 +213,7 @@ def test_a_video_that_moved_since_it_was_imported(given: Filmed, tmp_path: Path,
     assert open_recording(folder, cameras=["02"]).image("02", 0).shape == (136, 240, 3)
 
 
-def test_a_calibration_folder_is_not_searched_without_end(
-    given: Filmed, tmp_path: Path, refused: Refused, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_calibration_folder_is_not_searched_without_end(given: Filmed, tmp_path, refused, monkeypatch) -> None:
     monkeypatch.setattr("d2_plugin.recordings.importing.steps.MOST_FILES", 5)
     (tmp_path / "home").mkdir()
     for number in range(6):

@@ -1,7 +1,5 @@
 """Which image of which video belongs to a frame of the recording, and by how much it is late."""
 
-from __future__ import annotations
-
 from fractions import Fraction
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """From videos to a recording: offsets, gains, turns and dropped frames are undone, and a stopped import goes on."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from fractions import Fraction
 from pathlib import Path
@@ -105,9 +103,7 @@ def test_gains_are_within_one_percent_of_what_was_applied(filmed: Filmed, import
     assert np.abs(measured - (applied - applied.mean(0))).max() < 0.01
 
 
-def test_images_that_stay_in_the_videos_are_the_same_as_written_ones(
-    filmed: Filmed, imported: Path, tmp_path: Path
-) -> None:
+def test_images_that_stay_in_the_videos_are_the_same_as_written_ones(filmed: Filmed, imported: Path, tmp_path) -> None:
     import_videos(settings_of(filmed, tmp_path / "written", frames=(0, 3), exposure=False))
     opened, written = open_recording(imported), open_recording(tmp_path / "written")
     assert opened.layout == "videos"
@@ -136,18 +132,14 @@ def test_moments_lie_where_little_is_decoded_from_the_first_frame_to_the_last() 
     assert moments(tuple(range(0, 300, 48))) == (0, 48, 96, 192, 240, 299)
 
 
-def test_the_commands_and_a_stopped_import_goes_on(
-    filmed: Filmed, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_commands_and_a_stopped_import_goes_on(filmed: Filmed, tmp_path: Path, answered, monkeypatch) -> None:
     folder = tmp_path / "c"
     words = ["import", str(filmed.videos), "--calibration", str(filmed.calibration), "--output", str(folder)]
     words += ["--scale", "0.5", "--times", "0,0.1", "--offsets", "sound"]
-    assert main(words) == 0
-    said = capsys.readouterr().out
+    said = answered(*words)
     assert "start in frames, by sound: 01 +0.00, 02 -7.5" in said
     assert "3 cameras, 3 frames at 24 per second, 160x90 pixels" in said
-    assert main(["plan", str(folder), "--train-cameras", "all"]) == 0
-    said = capsys.readouterr().out
+    said = answered("plan", str(folder), "--train-cameras", "all")
     assert "3 training cameras, " in said
     assert "cameras expose up to 0." in said
     files = [folder / "import" / "clocks.json", folder / "cameras.json", *(folder / "images").rglob("*.png")]

@@ -1,7 +1,5 @@
 """From real videos and their calibration to a trained scene with one command: pose2sim's four cameras."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -19,7 +17,6 @@ pytest.importorskip("cv2")
 
 @pytest.fixture
 def pose2sim(shared_data: Callable[[str], Path], tmp_path: Path) -> Callable[[int], Filmed]:
-    """Videos of its first frames."""
     recording = open_recording(shared_data("pose2sim_single"))
     shootings = {name: Shooting() for name in recording.cameras}
     return lambda frames: video(select_frames(recording, recording.frames[:frames]), tmp_path / "filmed", shootings)
@@ -30,13 +27,10 @@ def words(filmed: Filmed, run: Path, *more: str) -> list[str]:
     return [*given, "--output", str(run), "--import.scale", "0.2", *more]
 
 
-def test_four_real_videos_become_a_scene(
-    pose2sim: Callable[[int], Filmed], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_four_real_videos_become_a_scene(pose2sim: Callable[[int], Filmed], tmp_path: Path, capsys, answered) -> None:
     run = tmp_path / "run"
     command = words(pose2sim(4), run, "--import.offsets", "none", "--import.frames", "0:3:3", "--hooks", "none")
-    assert main([*command, "--iterations", "20"]) == 0
-    said = capsys.readouterr().out
+    said = answered(*command, "--iterations", "20")
     assert "8 images of 4 cameras" in said
     metrics = json.loads((run / "metrics.json").read_text())
     assert metrics["test"] is None

@@ -1,8 +1,5 @@
 """A video as its container describes it: time stamps, turn, timecode, and its frames in any order."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -61,9 +58,7 @@ def test_frames_in_any_order_are_the_same(unsteady: tuple[Path, np.ndarray]) -> 
     assert all((decoder.image(index) == kept[index]).all() for index in (17, 3, 29))
 
 
-def test_no_frame_is_decoded_that_a_key_frame_makes_needless_nor_twice(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_no_frame_is_decoded_that_a_key_frame_makes_needless_nor_twice(tmp_path: Path, monkeypatch) -> None:
     """Moments far apart, in a video with several key frames."""
     path = write_video(tmp_path / "a.mp4", images(50) * 3, list(np.arange(150) / 30), gop=30)
     placed, place = [], Decoder._place
@@ -137,9 +132,7 @@ def wall(count: int, shift: int = 0, gain: float = 1.0) -> list[np.ndarray]:
 
 
 @pytest.mark.parametrize(("shift", "gain", "moved", "drift"), [(0, 1, 0, 0), (12, 1, 12, 0), (0, 1.25, 0, 0.25)])
-def test_a_camera_that_was_moved_or_drifts_is_noticed(
-    shift: int, gain: float, moved: float, drift: float, tmp_path: Path
-) -> None:
+def test_a_camera_that_was_moved_or_drifts_is_noticed(shift, gain, moved, drift, tmp_path) -> None:
     path = write_video(tmp_path / "a.mp4", wall(24, shift, gain), [i / 24 for i in range(24)])
     camera = CalibratedCamera("a", 160, 120, Lens(pinhole(160, 160, 80, 60)), np.eye(4))
     source = VideosSource(
@@ -168,9 +161,7 @@ class Bumped(Source):
 
 
 @pytest.mark.parametrize(("name", "camera"), [("studio", "02"), ("dome", "03")])
-def test_a_camera_that_is_bumped_by_half_a_degree_is_noticed_though_people_walk(
-    shared_data: Callable[[str], Path], name: str, camera: str
-) -> None:
+def test_a_camera_that_is_bumped_by_half_a_degree_is_noticed_though_people_walk(shared_data, name, camera) -> None:
     """Mostly about its own axis, where nothing in the middle of the image moves."""
     whole = select_cameras(open_recording(shared_data(name)), (camera,))
     recording = select_frames(whole, spread(whole.frames, 9))

@@ -1,7 +1,5 @@
 """Small moving scenes for tests of exports, made from the bundled backbones without training them."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from tiny import make_adapter, make_model, make_views
@@ -82,11 +80,7 @@ def rasterized(
     with torch.no_grad():
         render = model.render(View(view.camera, 0, time, T_camera_world, K, finer * WIDTH, finer * HEIGHT))
     depth = render.depth_sum / render.alpha.clamp(min=1e-4)
-    return {
-        "color": render.color.clamp(0, 1).numpy(),
-        "depth": depth.numpy(),
-        "opacity": render.alpha.numpy(),
-    }
+    return {"color": render.color.clamp(0, 1).numpy(), "depth": depth.numpy(), "opacity": render.alpha.numpy()}
 
 
 def psnr(a: np.ndarray, b: np.ndarray) -> float:

@@ -1,14 +1,11 @@
 """`d2 export` as a person meets it: every mistake is one sentence, and what was written is said."""
 
-from __future__ import annotations
-
 import re
 import shutil
 from pathlib import Path
 
 import pytest
 import torch
-from command_lines import refused
 from oracles.export_files import ReadPage
 
 from d2_plugin.commands.cli import main
@@ -31,9 +28,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("backbone", ["yang4d", "deform"])
-def test_a_run_becomes_a_page_of_a_stated_size(
-    trained: Path, backbone: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_becomes_a_page_of_a_stated_size(trained: Path, backbone: str, capsys) -> None:
     assert main(["export", str(trained / backbone)]) == 0
     path = trained / backbone / "export" / "scene.html"
     said = capsys.readouterr().out
@@ -46,7 +41,7 @@ def test_a_run_becomes_a_page_of_a_stated_size(
     assert header["models"][0]["background"] == torch.cat([background.constant, background.harmonics]).tolist()
 
 
-def test_frames_are_chosen_by_number(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_frames_are_chosen_by_number(trained: Path, capsys, refused) -> None:
     run = str(trained / "yang4d")
     assert main(["export", run, "--format", "ply", "--frames", "0:2:2"]) == 0
     folder = trained / "yang4d" / "export" / "ply"
@@ -54,13 +49,13 @@ def test_frames_are_chosen_by_number(trained: Path, capsys: pytest.CaptureFixtur
     said = capsys.readouterr().out
     assert f"2 files in {folder}" in said
     assert "the background behind the Gaussians is left out" in said
-    assert "no frame 7: it has 0 to 2" in refused(capsys, "export", run, "--format", "ply", "--frames", "7")
-    assert "--frames is for ply, sog, spz, glb" in refused(capsys, "export", run, "--frames", "1")
-    assert "--frames" in refused(capsys, "export", run, "--format", "ply", "--frames", "")
+    assert "no frame 7: it has 0 to 2" in refused("export", run, "--format", "ply", "--frames", "7")
+    assert "--frames is for ply, sog, spz, glb" in refused("export", run, "--frames", "1")
+    assert "--frames" in refused("export", run, "--format", "ply", "--frames", "")
 
 
 def test_a_share_of_the_gaussians_is_kept_and_what_that_costs_is_said(
-    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    trained, tmp_path, capsys, refused, monkeypatch
 ) -> None:
     monkeypatch.setattr(compact, "STEPS", 20)
     run, sizes = str(trained / "yang4d"), []
@@ -73,30 +68,27 @@ def test_a_share_of_the_gaussians_is_kept_and_what_that_costs_is_said(
     after, before, kept, whole = re.search(form, said).groups()
     assert float(after) > float(before), "20 steps more of a run of four"
     assert [f"{model['scores']['']:.2f}" for model in sizes] == [whole, kept]
-    assert "keep must be above 0" in refused(capsys, "export", run, "--keep", "0")
+    assert "keep must be above 0" in refused("export", run, "--keep", "0")
 
 
-def test_what_cannot_be_exported_is_one_sentence(
-    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_cannot_be_exported_is_one_sentence(trained: Path, tmp_path: Path, refused) -> None:
     run = trained / "yang4d"
-    assert "4dgs" in refused(capsys, "export", run, "--format", "splatv")
-    assert "holds no run" in refused(capsys, "export", tmp_path)
+    assert "4dgs" in refused("export", run, "--format", "splatv")
+    assert "holds no run" in refused("export", tmp_path)
     copy = Path(shutil.copytree(run, tmp_path / "run"))
     (copy / "checkpoint.pt").write_bytes((copy / "checkpoint.pt").read_bytes()[:1000])
-    assert "is damaged" in refused(capsys, "export", copy)
+    assert "is damaged" in refused("export", copy)
 
 
-def test_two_runs_become_one_page_by_export_and_by_compare(
-    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_two_runs_become_one_page_by_export_and_by_compare(trained: Path, tmp_path: Path, answered, refused) -> None:
     runs = [str(trained / name) for name in ("yang4d", "deform")]
     assert main(["export", *runs, "--output", str(tmp_path)]) == 0
-    assert main(["compare", *runs, "--page", str(tmp_path / "compared.html")]) == 0
-    assert f"Page: {tmp_path / 'compared.html'}" in capsys.readouterr().out
+    assert f"Page: {tmp_path / 'compared.html'}" in answered(
+        "compare", *runs, "--page", str(tmp_path / "compared.html")
+    )
     for name in ("scene.html", "compared.html"):
         header = ReadPage(tmp_path / name).header
         assert [model["name"] for model in header["models"]] == ["yang4d", "deform"]
         assert header["models"][0]["scores"].keys() == {"", "test0"}
         assert list(header["recorded"]) == ["test0"]
-    assert "give one, or for a page" in refused(capsys, "export", *runs, "--format", "ply")
+    assert "give one, or for a page" in refused("export", *runs, "--format", "ply")

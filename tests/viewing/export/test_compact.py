@@ -1,7 +1,5 @@
 """`d2 export --keep`: what goes is what images would miss least, and what is left is trained on."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

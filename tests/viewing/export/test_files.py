@@ -1,7 +1,5 @@
 """Every format read back: what a reader finds is what was trained, within what the format says it keeps."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import subprocess
@@ -132,9 +130,7 @@ class TestThePage:
 
 
 class TestKeys:
-    def test_at_its_keys_it_is_the_model_and_between_them_as_far_off_as_it_says(
-        self, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
+    def test_at_its_keys_it_is_the_model_and_between_them_as_far_off_as_it_says(self, monkeypatch) -> None:
         scene = make_scene(sharp_model("deform"))
         many = bake(scene)
         monkeypatch.setattr("d2_plugin.viewing.export.keys.GOOD", 1e3)
@@ -211,9 +207,7 @@ class TestOthersReadIt:
         assert (apart.amin(1) * scene.pixels_per_unit(true.positions[kept])).quantile(0.95) < 0.5
         assert (true.opacities[kept] - opacities[apart.argmin(1)]).abs().quantile(0.9) < 0.01
 
-    def test_without_the_converter_one_sentence_says_how_to_get_it(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
+    def test_without_the_converter_one_sentence_says_how_to_get_it(self, tmp_path: Path, monkeypatch) -> None:
         monkeypatch.setenv("PATH", str(tmp_path))
         with pytest.raises(D2Error, match="npm install -g @playcanvas/splat-transform"):
             write_export([make_scene(sharp_model("yang4d", 50))], Export((Path(),), "sog", frames=(0,)), tmp_path)

@@ -1,7 +1,5 @@
 """The exported page in a real browser: offline, it plays, and what it shows is what our rasterizer draws."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -179,9 +177,7 @@ def test_in_an_image_of_more_pixels_the_blur_is_of_the_recordings(new_page: Call
     assert psnr(seen, rasterized(model, 2, 0.0, finer=2)["color"]) > 45
 
 
-def test_a_camera_that_looks_away_from_all_gaussians_shows_the_background(
-    new_page: Callable[[], Page], tmp_path: Path
-) -> None:
+def test_a_camera_that_looks_away_from_all_gaussians_shows_the_background(new_page, tmp_path) -> None:
     model = sharp_model("yang4d")
     scene = make_scene(model, "tiny", CAMERAS)
     around = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0]))  # half a turn about the vertical
@@ -310,9 +306,7 @@ class TestTheFreeCamera:
 PHONE = {"viewport": {"width": 390, "height": 844}, "has_touch": True, "is_mobile": True}
 
 
-def test_a_phone_has_one_row_of_controls_large_enough_and_an_image_without_what_nobody_recorded(
-    compared: Page,
-) -> None:
+def test_a_phone_has_one_row_of_controls_large_enough_and_an_image_without_what_nobody_recorded(compared: Page) -> None:
     context = compared.page.context.browser.new_context(**PHONE)
     page = begun(Page(context.new_page()), compared.page.url)
     boxes = [page.page.locator(f"#{name}").bounding_box() for name in ("play", "time", "camera", "more")]

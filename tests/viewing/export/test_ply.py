@@ -1,7 +1,5 @@
 """The PLY of one instant: what viewers of 3DGS read is what the backbone draws."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import torch
