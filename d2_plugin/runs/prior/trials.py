@@ -53,8 +53,6 @@ MOST_LEFT_OUT = 2
 """Cameras that are left out, spread evenly in the order in which they are named."""
 CLEAR = 0.01
 """A difference of SSIM at one left-out camera that needs no second one."""
-ALIKE = 0.005
-"""Where stereo alone is better by less, all of the prior is used: it knows surfaces that stereo does not."""
 
 
 class Score(NamedTuple):
@@ -76,8 +74,8 @@ class Trials:
 
     @property
     def choice(self) -> Belief:
-        """The whole prior where it predicts left-out cameras as well, else stereo alone."""
-        return "all" if _mean_ssim(self.everything) > _mean_ssim(self.stereo) - ALIKE else "stereo"
+        """What predicts left-out cameras better."""
+        return "all" if _mean_ssim(self.everything) > _mean_ssim(self.stereo) else "stereo"
 
     def __str__(self) -> str:
         believed = self.choice == "all"
