@@ -149,7 +149,7 @@ def out_of_sight(
     """
     alive, seen = torch.zeros(2, count, dtype=torch.bool, device=evaluation[0].splats.rows.device)
     for view, splats, _, _ in evaluation:
-        around = rim * splats.covariances[:, [0, 3, 5]].sum(1).sqrt()
+        around = rim * splats.covariances[:, [0, 3, 5]].sum(1).sqrt() if rim else 0.0
         for other in beside(view):
             alive[splats.rows] = True
             seen[splats.rows] |= other.sees(splats.means, around)

@@ -89,9 +89,7 @@ def test_a_depth_range_ten_times_too_wide_does_no_harm(rig: Rig) -> None:
     assert wide["median"] < 1.1 * narrow["median"]
 
 
-def test_what_one_view_found_helps_the_others_and_is_no_more_often_wrong(
-    rig: Rig, native: Maps, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_one_view_found_helps_the_others(rig: Rig, native: Maps, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "_exchange", lambda *arguments: None)
     alone = raw(rig)
     assert share_within(native, rig, 0.01) > share_within(alone, rig, 0.01) + 0.01
@@ -141,7 +139,7 @@ def test_only_good_planes_are_handed_over_the_best_of_them_and_none_seen_edge_on
     both = handed_over(empty, [near(theirs, cost=0.1), far(third, cost=0.2)])
     np.testing.assert_array_equal(both[one.any(-1)], one[one.any(-1)])
     across = theirs.centre - ours.centre  # a plane through our centre
-    assert np.isfinite(handed_over(empty, [seen_plane(theirs, across, across @ ours.centre, 0.1)])).all()
+    assert not handed_over(empty, [seen_plane(theirs, across, across @ ours.centre, 0.1)]).any()
 
 
 @pytest.mark.parametrize("scale", [1e-3, 1e4])
