@@ -18,7 +18,7 @@ VARIANTS: tuple[Variant, ...] = get_args(Variant)
 EPSILON = 1e-9
 """The paper's eps, world units."""
 CONFIRMS, NEAR = 2.0, 0.1
-"""A map confirms a match that the tests of stereo refuse within so many of its sigmas and within this relative difference."""
+"""A map confirms a match that the tests refuse within so many of its sigmas and within this relative difference."""
 SURER, SUREST = 0.25, 0.005
 """Sigma of such a match: this share of the map's and of how far the two are apart, and no less than that."""
 
