@@ -1,5 +1,6 @@
 """Training cameras that are left out decide what of the prior is worth inserting."""
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +16,7 @@ from d2_plugin.priors.summary import PriorSummary
 from d2_plugin.protocol import DepthPrior, Label
 from d2_plugin.recordings import Recording, open_recording
 from d2_plugin.runs.plan import Decision
-from d2_plugin.runs.prior.trials import Score, Trials, can_decide, leave_out_in_turn, left_out, small_prior
+from d2_plugin.runs.prior.trials import Trials, can_decide, leave_out_in_turn, left_out, small_prior
 from d2_plugin.runs.run import Run
 from d2_plugin.runs.settings import RunSettings
 from d2_plugin.runs.start import TimedPoints
@@ -25,7 +26,7 @@ from d2_plugin.store.store import PriorStore
 NETWORK = "mobile_pydnet.onnx"
 TRAINED, WIDTH, HEIGHT = ("train0", "train1", "train2"), 128, 72
 NO_POINTS = TimedPoints(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
-GOOD, BAD = Score(0.8, 24.0), Score(0.7, 25.0)
+GOOD, BAD = 0.8, 0.7
 
 
 def prior_of(labels: list[int]) -> DepthPrior:
@@ -66,12 +67,23 @@ def test_a_small_image_gets_the_depth_of_the_middle_of_its_pixels_and_their_mean
 
 
 def test_ssim_at_left_out_cameras_decides_and_one_line_says_so() -> None:
-    helps, harms = Trials({"a": GOOD}, {"a": BAD}, 1.0), Trials({"a": BAD}, {"a": GOOD}, 1.0)
+    helps, harms = Trials({"a": GOOD}, {"a": BAD}, 0.1, 1.0), Trials({"a": BAD}, {"a": GOOD}, 0.01, 1.0)
     assert (helps.choice, harms.choice) == ("all", "stereo")
-    assert Trials({"a": Score(0.797, 24.0)}, {"a": GOOD}, 1.0).choice == "stereo"
     assert "confirms stereo, which alone is used (left-out cameras: SSIM 0.700 with it, 0.800 without)" in str(harms)
     assert "the whole prior is used" in str(helps)
-    assert harms.as_dict()["scores"]["all"] == {"a": {"ssim": 0.7, "psnr": 25.0}}
+    assert harms.as_dict()["ssim"] == {"all": {"a": 0.7}, "stereo": {"a": 0.8}}
+
+
+@pytest.mark.parametrize(
+    ("behind", "declared", "choice"),
+    [(0.003, 0.05, "all"), (0.006, 0.05, "stereo"), (0.003, 0.08, "stereo"), (0.003, math.nan, "stereo")],
+)
+def test_where_images_are_as_good_a_network_that_declares_small_errors_adds_its_surfaces(
+    behind: float, declared: float, choice: str
+) -> None:
+    tie = Trials({"a": GOOD - behind}, {"a": GOOD}, declared, 1.0)
+    assert tie.choice == choice
+    assert ("has more surfaces" in str(tie)) is (choice == "all")
 
 
 @pytest.mark.parametrize(("cameras", "chosen"), [("ab", "ab"), ("abc", "ac"), ("abcd", "bd"), ("abcdefgh", "cg")])
@@ -106,7 +118,9 @@ def test_depth_that_is_right_is_believed_and_depth_that_is_not_is_not_whatever_i
     settings = RunSettings(str(room), TRAINED)
     scene = Run(settings, tmp_path / "run").scene
     store = PriorStore.open(stored(tmp_path / "priors", scene.recording, wrong))
-    assert leave_out_in_turn(settings, scene, NO_POINTS, store).choice == choice
+    trials = leave_out_in_turn(settings, scene, NO_POINTS, store)
+    assert trials.choice == choice
+    assert trials.declared == pytest.approx(0.1, rel=0.1), "what stands alone, not what stereo verified"
 
 
 @pytest.fixture
@@ -116,7 +130,7 @@ def tried(monkeypatch: pytest.MonkeyPatch) -> list[RunSettings]:
 
     def told(settings: RunSettings, *_: object) -> Trials:
         made.append(settings)
-        return Trials({"a": BAD}, {"a": GOOD}, 1.0)
+        return Trials({"a": BAD}, {"a": GOOD}, 0.1, 1.0)
 
     monkeypatch.setattr("d2_plugin.runs.prior.trials.leave_out_in_turn", told)
     summary = PriorSummary(views={("a", 0): {"shares": {"verified": 1.0}, "sigmas": {}, "refused": None}})

@@ -13,11 +13,12 @@ for both beliefs alike.
 from __future__ import annotations
 
 import contextlib
+import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -29,9 +30,9 @@ from d2_plugin.durable import CannotWrite, write_table
 from d2_plugin.hooks.prior import Belief, Store
 from d2_plugin.plugin import D2Hooks
 from d2_plugin.progress import progress_bar
-from d2_plugin.protocol import DepthPrior
+from d2_plugin.protocol import DepthPrior, Label
 from d2_plugin.recordings import open_recording
-from d2_plugin.runs.metrics import psnr, ssim_range1
+from d2_plugin.runs.metrics import ssim_range1
 from d2_plugin.runs.scene import Scene
 from d2_plugin.runs.settings import HOOK_NAMES, RunSettings, hook_config
 from d2_plugin.runs.start import TimedPoints, make_view
@@ -53,47 +54,43 @@ MOST_LEFT_OUT = 2
 """Cameras that are left out, spread evenly in the order in which they are named."""
 CLEAR = 0.01
 """A difference of SSIM at one left-out camera that needs no second one."""
-
-
-class Score(NamedTuple):
-    """How well images of a left-out camera were predicted, mean over the instants."""
-
-    ssim: float
-    psnr: float
+TIE, EXACT = 0.005, 0.06
+"""Where stereo alone is better by less than the first, images decide nothing, and the whole prior is used if half of
+what the network alone knows declares an error below the second: it has depth where nothing can be matched."""
 
 
 @dataclass(frozen=True)
 class Trials:
     """What left-out training cameras say of the prior."""
 
-    everything: Mapping[str, Score]
-    """By left-out camera, where the others were trained with the whole prior."""
-    stereo: Mapping[str, Score]
+    everything: Mapping[str, float]
+    """SSIM of the images of each left-out camera, where the others were trained with the whole prior."""
+    stereo: Mapping[str, float]
     """The same with stereo alone."""
+    declared: float
+    """Median sigma of the depths that the network alone knows."""
     cpu_seconds: float
 
     @property
     def choice(self) -> Belief:
-        """What predicts left-out cameras better."""
-        return "all" if _mean_ssim(self.everything) > _mean_ssim(self.stereo) else "stereo"
+        """What predicts left-out cameras better, or as well with more depth."""
+        behind = _mean(self.stereo) - _mean(self.everything)
+        return "all" if behind < (TIE if self.declared < EXACT else 0) else "stereo"
 
     def __str__(self) -> str:
-        believed = self.choice == "all"
-        verdict = "is worth inserting: the whole prior is used" if believed else "confirms stereo, which alone is used"
-        with_it, without = _mean_ssim(self.everything), _mean_ssim(self.stereo)
+        with_it, without = _mean(self.everything), _mean(self.stereo)
+        why = "is worth inserting" if with_it > without else "has more surfaces for images as good"
+        verdict = f"{why}: the whole prior is used" if self.choice == "all" else "confirms stereo, which alone is used"
         return f"here monocular depth {verdict} (left-out cameras: SSIM {with_it:.3f} with it, {without:.3f} without)"
 
     def as_dict(self) -> dict[str, Any]:
         """For the table beside the prior and for metrics.json."""
-        scores = {
-            name: {camera: score._asdict() for camera, score in found.items()}
-            for name, found in (("all", self.everything), ("stereo", self.stereo))
-        }
-        return {"choice": self.choice, "text": str(self), "cpu_seconds": self.cpu_seconds, "scores": scores}
+        ssim = {"all": dict(self.everything), "stereo": dict(self.stereo)}
+        return {"choice": self.choice, "text": str(self), "cpu_seconds": self.cpu_seconds, "ssim": ssim}
 
 
-def _mean_ssim(scores: Mapping[str, Score]) -> float:
-    return float(np.mean([score.ssim for score in scores.values()]))
+def _mean(ssim: Mapping[str, float]) -> float:
+    return float(np.mean(list(ssim.values())))
 
 
 def can_decide(scene: Scene) -> bool:
@@ -129,17 +126,17 @@ def leave_out_in_turn(settings: RunSettings, scene: Scene, points: TimedPoints, 
     """
     begin = time.process_time()
     trial = _Trial.of(settings, scene, points, store)
-    scores: dict[Belief, dict[str, Score]] = {"all": {}, "stereo": {}}
+    scores: dict[Belief, dict[str, float]] = {"all": {}, "stereo": {}}
     chosen = left_out(scene.train_cameras)
     with progress_bar("trials", len(chosen) * len(scores)) as bar:
         for camera in chosen:
             others = [name for name in scene.train_cameras if name != camera]
             for belief, of_cameras in scores.items():
-                score = of_cameras[camera] = trial.score(trial.model(others, belief), camera)
-                bar.update(sum(map(len, scores.values())), f"without camera {camera}: SSIM {score.ssim:.3f}")
-            if abs(scores["all"][camera].ssim - scores["stereo"][camera].ssim) >= CLEAR:
+                ssim = of_cameras[camera] = trial.score(trial.model(others, belief), camera)
+                bar.update(sum(map(len, scores.values())), f"without camera {camera}: SSIM {ssim:.3f}")
+            if abs(scores["all"][camera] - scores["stereo"][camera]) >= CLEAR:
                 break
-    return Trials(scores["all"], scores["stereo"], time.process_time() - begin)
+    return Trials(scores["all"], scores["stereo"], trial.declared(), time.process_time() - begin)
 
 
 def left_out(cameras: Sequence[str]) -> tuple[str, ...]:
@@ -188,16 +185,22 @@ class _Trial:
         trainer.run()
         return trainer.model
 
+    def declared(self) -> float:
+        """Median sigma of what the network alone knows at the instants of the trial; NaN where that is nothing."""
+        priors = [self.store.prior(c, f) for c in self.scene.train_cameras for f in self.scene.recording.frames]
+        alone = [p.sigma[p.labels == Label.MONO] for p in priors if p is not None and p.sigma is not None]
+        return float(torch.cat(alone).median()) if alone else math.nan
+
     @torch.no_grad()
-    def score(self, model: Any, camera: str) -> Score:
-        """How well a model predicts a camera."""
+    def score(self, model: Any, camera: str) -> float:
+        """How well a model predicts a camera: SSIM, mean over the instants."""
         scores = []
         for frame in self.scene.recording.frames:
             truth = torch.from_numpy(self.scene.recording.image(camera, frame)).float() / 255
             view = make_view(self.scene.recording, camera, frame, self.settings.device)
             predicted = model.render(view).color.cpu().clamp(0, 1)
-            scores.append((ssim_range1(predicted, truth), psnr(predicted, truth)))
-        return Score(*np.mean(scores, axis=0).tolist())
+            scores.append(ssim_range1(predicted, truth))
+        return float(np.mean(scores))
 
 
 class SmallStore:
