@@ -11,13 +11,11 @@ from refusals import refuses
 from rigs import NOISE, arc, moved, seen_by, worst
 
 from d2_plugin.recordings import open_recording, select_cameras
-from d2_plugin.recordings.cameras.calibrating.bundle import project
 from d2_plugin.recordings.cameras.calibrating.features import find_features
 from d2_plugin.recordings.cameras.calibrating.refine import Turn, refine_poses, turns_in_words
-from d2_plugin.recordings.cameras.calibrating.rig import aligned
 from d2_plugin.recordings.cameras.calibrating.solve import solve_features, solve_rig
-from d2_plugin.recordings.cameras.camera import rig_width, rigid
-from d2_plugin.recordings.cameras.epipolar import degrees_between, sampson
+from d2_plugin.recordings.cameras.camera import rig_width
+from d2_plugin.recordings.cameras.epipolar import degrees_between
 from d2_plugin.recordings.selection import spread
 
 pytest.importorskip("pycolmap", reason="pycolmap is in the `calibration` extra")
@@ -137,23 +135,3 @@ def test_features_lie_where_things_are_not_a_quarter_of_a_pixel_beside() -> None
     for centre in centres:
         nearest = found[np.linalg.norm(found - centre, axis=1).argmin()]
         np.testing.assert_allclose(nearest, centre, atol=0.1)
-
-
-def test_sampsons_distance_is_zero_for_what_both_see_and_grows_by_the_pixel() -> None:
-    cameras = arc(2)
-    points = np.random.default_rng(0).uniform(-1, 1, (50, 3))
-    p, q = (project(camera, points) for camera in cameras.values())
-    assert np.abs(sampson(cameras["c0"], cameras["c1"], p, q)).max() < 1e-9
-    off = sampson(cameras["c0"], cameras["c1"], p, q + [0, 2.0])  # across the lines, shared by the two
-    assert 0.9 < np.median(off) < 1.6
-
-
-def test_a_rig_is_laid_over_another_by_its_rotations() -> None:
-    cameras = arc(2)  # two centres alone leave a turn about their line open
-    R = cv2.Rodrigues(np.array([0.3, -0.8, 0.5]))[0]
-    turned = {}
-    for name, camera in cameras.items():
-        T = camera.T_camera_world
-        turned[name] = replace(camera, T_camera_world=rigid(T[:3, :3] @ R, 3 * T[:3, 3] + T[:3, :3] @ [1.0, 2, 3]))
-    for name, camera in aligned(turned, cameras).items():
-        np.testing.assert_allclose(camera.T_camera_world, cameras[name].T_camera_world, atol=1e-9)

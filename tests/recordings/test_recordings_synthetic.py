@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+from refusals import refuses
 
 from benchmarks.priors_motion import scene_flow
-from d2_plugin.errors import D2Error
 from d2_plugin.recordings.recording import Camera, Recording
 from d2_plugin.recordings.synthetic.raycast import render_depth
 from d2_plugin.recordings.synthetic.room import furnished_room, synthetic_recording
@@ -72,5 +72,4 @@ def test_a_returned_image_is_the_callers_own(recording: Recording) -> None:
 
 @pytest.mark.parametrize("wrong", [{"cameras": 0}, {"frames": 0}, {"width": 4}, {"fps": 0.0}, {"held_out": -1}])
 def test_impossible_recordings_are_refused(wrong: dict) -> None:
-    with pytest.raises(D2Error, match="is not possible"):
-        synthetic_recording(**wrong)
+    refuses("is not possible", synthetic_recording, **wrong)

@@ -102,8 +102,8 @@ def test_stereo_left_out_by_the_user_leaves_out_what_follows_from_it(moving) -> 
 
 
 def test_what_cannot_be_is_not_overridden(moving) -> None:
-    with pytest.raises(D2Error, match=r"\[plan\] stereo = true, but one training camera: it takes a second"):
-        plan_scene(moving, ["train0"], None).override(stereo=True)
+    alone = plan_scene(moving, ["train0"], None)
+    refuses(r"\[plan\] stereo = true, but one training camera: it takes a second", alone.override, stereo=True)
     twice = replace(moving, cameras=dict.fromkeys(("train0", "train1"), moving.cameras["train0"]))
     with pytest.raises(D2Error, match="all training cameras stand at one point: it takes cameras that stand apart"):
         plan_scene(twice, PAIR, None).override(stereo=True)
@@ -134,15 +134,6 @@ def test_angles_that_cannot_be_matched_are_no_overlap() -> None:
     assert min(measure_overlap(across, StereoSettings(max_angle=120.0)).shares) > 0.3
     still = [camera("a", near_far=AT_TWO), camera("b", 1e-3, near_far=AT_TWO)]
     assert max(measure_overlap(still, StereoSettings()).shares) == 0
-
-
-def test_points_tell_the_depths_where_no_range_is_declared() -> None:
-    pair = [camera("a"), camera("b", 0.5)]
-    points = np.random.default_rng(0).uniform((-0.5, -0.5, 1.99), (1, 0.5, 2.01), (200, 3))
-    found = measure_overlap(pair, StereoSettings(), points=points)
-    assert found.depth_known
-    assert found.shares == pytest.approx((0.75, 0.75))
-    assert not measure_overlap(pair, StereoSettings(), points=points[:5]).depth_known
 
 
 def test_unknown_depths_give_the_most_that_could_be_seen() -> None:

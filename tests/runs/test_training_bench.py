@@ -16,8 +16,8 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from refusals import refuses
 
-from d2_plugin.errors import D2Error
 from d2_plugin.runs.ablation.presets import PRESETS
 from d2_plugin.runs.rows import TRY, Row, make_row
 from d2_plugin.runs.settings import RunSettings
@@ -65,8 +65,7 @@ class TestCases:
 
     @pytest.mark.parametrize("text", ["studio", "@00", "a@b@c@d", ""])
     def test_a_recording_without_cameras_is_refused_with_an_example(self, text: str) -> None:
-        with pytest.raises(D2Error, match="PATH@00"):
-            case_of(text, SETTINGS)
+        refuses("PATH@00", case_of, text, SETTINGS)
 
 
 def pretend(work: Work, seconds_per_step: float = 0.05) -> Row:

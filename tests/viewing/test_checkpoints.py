@@ -18,7 +18,6 @@ from d2_plugin import registry
 from d2_plugin.adapters.fudan import FudanAdapter
 from d2_plugin.adapters.spacetime import SpacetimeAdapter
 from d2_plugin.commands.cli import main
-from d2_plugin.errors import D2Error
 from d2_plugin.protocol import Splats, View
 from d2_plugin.viewing.checkpoints import open_viewed
 from d2_plugin.viewing.checkpoints.files import read_options, read_ply
@@ -326,9 +325,7 @@ class TestRefused:
     )
     def test_a_checkpoint_whose_tensors_do_not_fit_is_one_sentence(self, room, tmp_path, name, value, said) -> None:
         torch.save((tuple((still(20) | {name: value}).values()), 1), tmp_path / "a.pth")
-        with pytest.raises(D2Error, match=said) as caught:
-            open_viewed(tmp_path / "a.pth", room)
-        assert "\n" not in str(caught.value)
+        refuses(said, open_viewed, tmp_path / "a.pth", room)
 
 
 def furthest(page: ReadPage, true: Splats, time: float) -> Tensor:

@@ -1,7 +1,6 @@
 """From videos to a recording: offsets, gains, turns and dropped frames are undone, and a stopped import goes on."""
 
 from collections.abc import Callable
-from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -17,8 +16,8 @@ from d2_plugin.recordings.importing.importing import import_videos
 from d2_plugin.recordings.importing.settings import ImportSettings
 from d2_plugin.recordings.importing.source import MOMENTS, Cut, VideosSource
 from d2_plugin.recordings.importing.steps import KIND
-from d2_plugin.recordings.importing.video import Decoder, VideoFile
-from d2_plugin.recordings.selection import select_frames, spread
+from d2_plugin.recordings.importing.video import Decoder
+from d2_plugin.recordings.selection import select_frames
 
 pytest.importorskip("av")
 pytest.importorskip("cv2")
@@ -121,15 +120,6 @@ def test_what_is_checked_is_decoded_once(decoded: tuple) -> None:
     asked = decoded[1]
     assert len(asked) <= (1 + MOMENTS) * len(NAMES)
     assert max(map(asked.count, asked)) <= 2
-
-
-def test_moments_lie_where_little_is_decoded_from_the_first_frame_to_the_last() -> None:
-    def moments(keys: tuple[int, ...]) -> tuple[int, ...]:
-        video = VideoFile(Path("a.mp4"), (100, 80), 0, np.arange(300), Fraction(1, 24), keys=keys)
-        return VideosSource({"a": video}, {"a": {k: k for k in range(300)}}, {}, {})._moments(range(300))
-
-    assert moments(()) == moments(tuple(range(300))) == tuple(spread(range(300), MOMENTS))
-    assert moments(tuple(range(0, 300, 48))) == (0, 48, 96, 192, 240, 299)
 
 
 def test_the_commands_and_a_stopped_import_goes_on(filmed: Filmed, tmp_path: Path, answered, monkeypatch) -> None:

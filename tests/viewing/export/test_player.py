@@ -108,14 +108,6 @@ def test_the_page_shows_what_the_rasterizer_draws(new_page: Callable[[], Page], 
     assert page.requests == []
 
 
-def test_images_of_other_times_and_cameras_or_without_the_background_would_not_pass(moving: Page) -> None:
-    model, here = sharp_model("yang4d"), shown(moving, 2, 0.21)
-    assert psnr(here, rasterized(model, 2, DURATION)["color"]) < 28
-    assert psnr(here, rasterized(model, 1, 0.21)["color"]) < 28
-    model.background = None
-    assert psnr(here, rasterized(model, 2, 0.21)["color"]) < 28
-
-
 def test_the_depth_view_is_the_expected_depth_on_its_scale(moving: Page, folder: Path) -> None:
     true = rasterized(sharp_model("yang4d"), 1, 0.21)
     low, high = ReadPage(folder / "moving.html").header["depth_range"]
