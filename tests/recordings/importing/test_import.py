@@ -1,5 +1,6 @@
-"""From videos to a recording: offsets, gains, turns and dropped frames are undone, and a stopped import goes on."""
+"""From videos to a recording, and to a scene: offsets, gains, turns, drops are undone; a stopped import goes on."""
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -165,3 +166,41 @@ def test_margins_of_undistorted_images_are_not_valid() -> None:
     assert valid.shape == (40, 50)
     assert valid[20, 25]
     assert not valid[0, 0]
+
+
+@pytest.fixture
+def pose2sim(shared_data: Callable[[str], Path], tmp_path: Path) -> Callable[[int], Filmed]:
+    recording = open_recording(shared_data("pose2sim_single"))
+    shootings = {name: Shooting() for name in recording.cameras}
+    return lambda frames: video(select_frames(recording, recording.frames[:frames]), tmp_path / "filmed", shootings)
+
+
+def words(filmed: Filmed, run: Path, *more: str) -> list[str]:
+    given = ["train", str(filmed.videos), "--calibration", str(filmed.calibration), "--train-cameras", "all"]
+    return [*given, "--output", str(run), "--import.scale", "0.2", *more]
+
+
+def test_four_real_videos_become_a_scene(pose2sim: Callable[[int], Filmed], tmp_path: Path, capsys, answered) -> None:
+    run = tmp_path / "run"
+    command = words(pose2sim(4), run, "--import.offsets", "none", "--import.frames", "0:3:3", "--hooks", "none")
+    said = answered(*command, "--iterations", "20")
+    assert "8 images of 4 cameras" in said
+    metrics = json.loads((run / "metrics.json").read_text())
+    assert metrics["test"] is None
+    assert metrics["train"]["psnr"] > 8
+    assert metrics["train_cameras"] == ["cam01", "cam02", "cam03", "cam04"]
+    assert len(list((run / "images").glob("*.png"))) == 8
+    recording = open_recording(tmp_path / "run-recording")
+    assert {(camera.width, camera.height) for camera in recording.cameras.values()} == {(72, 128)}
+    before = (run / "checkpoint.pt").read_bytes()
+    assert main([*command, "--iterations", "20"]) == 0  # every step is there already
+    assert "write images" not in capsys.readouterr().out
+    assert (run / "checkpoint.pt").read_bytes() == before
+
+
+@pytest.mark.slow
+def test_with_the_whole_method_and_motion_as_the_only_clock(pose2sim: Callable[[int], Filmed], tmp_path: Path) -> None:
+    assert main(words(pose2sim(20), tmp_path / "run", "--import.frames", "0:6:3", "--iterations", "60")) == 0
+    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert metrics["train"]["psnr"] > 12
+    assert metrics["prior"] is not None
