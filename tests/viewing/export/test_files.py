@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 import torch
 from oracles.export_files import ReadPage, covariances_from, covariances_of, read_still_ply
+from refusals import refuses
 from viewing.export.scenes import DURATION, make_scene, sharp_model
 
 from d2_plugin.backbones.yang4d import Yang4D, Yang4DSettings
-from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.moving import Harmonics, LinearMotion, MovingGaussians
 from d2_plugin.gaussians.slicing import slice_gaussians
+from d2_plugin.runs.start import make_view
+from d2_plugin.viewing.export import compact
 from d2_plugin.viewing.export.coded import encode, seen_rows
 from d2_plugin.viewing.export.export import Export, write_export
 from d2_plugin.viewing.export.keys import STILL, bake, cholesky, morton_order, state_at
@@ -91,8 +93,8 @@ class TestThePage:
 
     def test_runs_of_two_recordings_are_not_compared(self, tmp_path: Path) -> None:
         scenes = [make_scene(sharp_model("yang4d", 50), "a", names) for names in (("l", "m", "r"), ("l", "m", "s"))]
-        with pytest.raises(D2Error, match="of different recordings: compare runs of one recording"):
-            write_page(scenes, tmp_path / "scene.html")
+        says = "of different recordings: compare runs of one recording"
+        refuses(says, write_page, scenes, tmp_path / "scene.html")
 
     @pytest.mark.parametrize("backbone", ["yang4d", "deform"])
     def test_a_reader_finds_the_gaussians_within_a_hundredth_of_a_pixel(self, tmp_path: Path, backbone: str) -> None:
@@ -121,8 +123,8 @@ class TestThePage:
     def test_a_page_of_somebody_else_is_not_replaced(self, tmp_path: Path) -> None:
         scene, path = make_scene(sharp_model("yang4d", 50)), tmp_path / "scene.html"
         path.write_text("<p>mine</p>")
-        with pytest.raises(D2Error, match="was not written by `d2 export` and is kept: choose another place"):
-            write_export([scene], Export((Path(),)), tmp_path)
+        says = "was not written by `d2 export` and is kept: choose another place"
+        refuses(says, write_export, [scene], Export((Path(),)), tmp_path)
         assert path.read_text() == "<p>mine</p>"
         path.unlink()
         for _ in range(2):  # its own page is replaced
@@ -178,8 +180,8 @@ class TestOthersReadIt:
 
     def test_a_deformation_field_has_no_place_in_it(self, tmp_path: Path) -> None:
         pytest.importorskip("fourdgs", reason="fourdgs is in the `formats` extra")
-        with pytest.raises(D2Error, match="this model moves by a network: choose --format html or ply"):
-            write_export([make_scene(sharp_model("deform"))], Export((Path(),), "4dgs"), tmp_path)
+        scenes, says = [make_scene(sharp_model("deform"))], "this model moves by a network: choose --format html or ply"
+        refuses(says, write_export, scenes, Export((Path(),), "4dgs"), tmp_path)
 
     @pytest.mark.parametrize("kind", ["sog", "spz", "glb"])
     def test_others_read_what_splat_transform_writes(self, tmp_path: Path, kind: str) -> None:
@@ -209,5 +211,35 @@ class TestOthersReadIt:
 
     def test_without_the_converter_one_sentence_says_how_to_get_it(self, tmp_path: Path, monkeypatch) -> None:
         monkeypatch.setenv("PATH", str(tmp_path))
-        with pytest.raises(D2Error, match="npm install -g @playcanvas/splat-transform"):
-            write_export([make_scene(sharp_model("yang4d", 50))], Export((Path(),), "sog", frames=(0,)), tmp_path)
+        scenes, asked = [make_scene(sharp_model("yang4d", 50))], Export((Path(),), "sog", frames=(0,))
+        refuses("npm install -g @playcanvas/splat-transform", write_export, scenes, asked, tmp_path)
+
+
+class TestFewer:
+    """`d2 export --keep`: what goes is what images would miss least."""
+
+    def test_the_energy_of_a_gaussian_is_what_the_image_differs_by_without_it(self) -> None:
+        model = sharp_model("yang4d", 24)
+        viewed = make_scene(model).viewed
+        view, generator = make_view(viewed.recording, "middle", 4), torch.Generator().manual_seed(0)
+        energies = torch.zeros(24)
+        for _ in range(100):
+            compact._add_energies(energies, viewed.backbone, view, generator)
+        with torch.no_grad():
+            splats = viewed.backbone.slice_at(view)
+            whole = compact._color(viewed.backbone, view, splats.opacities)
+            true = torch.zeros(24)
+            for place, row in enumerate(splats.rows):
+                without = splats.opacities.clone()
+                without[place] = 0
+                true[row] = (compact._color(viewed.backbone, view, without) - whole).square().sum()
+        assert torch.equal(energies == 0, true == 0)
+        seen = true > 0.01 * true.max()
+        assert seen.sum() > 10
+        assert (energies[seen] / 100 / true[seen]).log2().abs().median() < 0.3
+        assert np.corrcoef(energies.argsort().argsort(), true.argsort().argsort())[0, 1] > 0.95
+
+    def test_a_checkpoint_of_another_trainer_is_refused(self) -> None:
+        viewed = make_scene(sharp_model("yang4d")).viewed
+        del viewed.backbone.model
+        refuses("tiny is no run of `d2 train`: leave out --keep", compact.compacted, viewed, 0.5)
