@@ -10,7 +10,6 @@ from benchmarks.never_worse.maps import SPOILED, Spoiled, spoiled_recording
 from benchmarks.priors import PriorsBench, cases, run
 from benchmarks.priors_section import DIAGONAL, priors
 from benchmarks.stereo_measure import score
-from benchmarks.stereo_rigs import Rig, textured_rig
 from d2_plugin.priors.declared_error import NORMAL_SHARE, frames_with_truth, reliability_curve
 from d2_plugin.priors.settings import PriorSettings
 from d2_plugin.recordings import open_recording
@@ -20,11 +19,6 @@ from d2_plugin.runs.report.report import make_report
 from d2_plugin.runs.rows import read_rows
 
 pytest.importorskip("cv2")
-
-
-@pytest.fixture(scope="module")
-def rig() -> Rig:
-    return textured_rig(2, width=192, height=108)
 
 
 def test_scores_count_what_they_say() -> None:
@@ -39,12 +33,6 @@ def test_scores_count_what_they_say() -> None:
     assert found.median == pytest.approx(0.0025, rel=1e-3)
     assert found.f1 == pytest.approx(2 * (4 / 6) * (3 / 8) / (4 / 6 + 3 / 8))
     assert found.pixels == 8
-
-
-def test_the_truth_itself_scores_full_marks_where_views_overlap(rig: Rig) -> None:
-    found = score(rig.truths, rig.truths, rig.covisible)
-    assert found.completeness == found.f1 == 1
-    assert 0.6 < np.mean(rig.covisible) < 0.95
 
 
 @pytest.mark.parametrize("times", [0.5, 1.0, 2.0])

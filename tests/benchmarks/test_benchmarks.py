@@ -1,18 +1,23 @@
-"""What holds for every part of `python -m benchmarks`: settings, help, where rows go, and the page of them all."""
+"""The parts of `python -m benchmarks`: settings, where rows go, peers that solve what they claim, and the page."""
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
 from benchmarks import memory, scaling
 from benchmarks.__main__ import PARTS, main
+from benchmarks.align_measure import TRUE_LINE, AlignMethod, align_problem, methods
 from benchmarks.gpu import proof as gpu
 from benchmarks.memory import in_fresh_process
 from benchmarks.report import EVERY
+from benchmarks.stability.gaussians import difference, random_rotation, random_scene, render, turned
+from benchmarks.stability.sweep import run_sweeps
 from benchmarks.work_precision import means, pareto_front, work_precision
 from d2_plugin.commands.cli import main as d2
 from d2_plugin.runs.report.report import BUILDERS, make_report
@@ -59,9 +64,6 @@ def test_a_part_adds_rows_of_what_it_measured_and_prints_their_tables(
     assert all(row["failed"] is None and row["command"].startswith(begins) for row in found)
 
 
-# ---------------------------------------------------------------- the page
-
-
 @pytest.mark.parametrize("kind", EVERY)
 def test_each_kind_becomes_a_section_also_where_nothing_has_a_result(kind: str, tmp_path: Path) -> None:
     rows = [row for row in read_rows([RUNS]) if row["kind"] == kind]
@@ -103,9 +105,6 @@ def test_means_over_cases_are_geometric_and_failures_keep_a_setting_off_the_fron
     assert {series.name: series.points[0].faded for series in plot.series} == {"a": False, "b": True, "c": True}
 
 
-# ---------------------------------------------------------------- growth and memory
-
-
 @LINUX
 def test_memory_is_that_of_the_work_not_of_what_was_there_before() -> None:
     before = np.ones(20_000_000)  # 160 MB that stay
@@ -113,3 +112,32 @@ def test_memory_is_that_of_the_work_not_of_what_was_there_before() -> None:
     assert result == 100_000_000
     assert 95 < peak < 130
     assert before[0] == 1
+
+
+@pytest.mark.parametrize("kind", ["relative", "metric"])
+@pytest.mark.parametrize("method", methods(), ids=lambda method: f"{method.name}, {method.setting}")
+def test_every_method_finds_the_line_when_nothing_is_wrong(method: AlignMethod, kind: str) -> None:
+    noisy = align_problem(kind, 2000, 0.0)
+    problem = replace(noisy, mono=noisy.clean_mono, geometric=noisy.truth)
+    line = method.fit(problem)
+    np.testing.assert_allclose(line, TRUE_LINE, rtol=2e-3, atol=2e-4)
+    assert problem.depth_error(line).max() < 5e-3
+
+
+FLOAT32_ENDS = {"world offset": 100.0}
+"""Beyond this float32 cannot hold the scene, which the report shows as a gap."""
+
+
+def test_nothing_fails_and_only_what_float32_cannot_hold_is_a_gap() -> None:
+    rows = run_sweeps()
+    assert [row for row in rows if row["verdict"] == "failure"] == []
+    for row in (row for row in rows if row["verdict"] == "gap"):
+        assert row["method"] == "float32"
+        assert row["value"] > FLOAT32_ENDS[row["case"]]
+
+
+def test_a_scene_that_is_another_one_is_seen_to_differ() -> None:
+    scene = random_scene()
+    image = render(scene, torch.float64)
+    assert difference(render(turned(scene, random_rotation(3)), torch.float64), image) < 1e-12
+    assert difference(render(scene._replace(means=scene.means + 1e-3), torch.float64), image) > 1e-4
