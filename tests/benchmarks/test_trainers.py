@@ -18,18 +18,13 @@ from benchmarks.trainers.bench import TrainersBench, rows_of, run
 from benchmarks.trainers.moving import Moving, save_truth
 from benchmarks.trainers.page import read_rows, replaced, table
 from benchmarks.trainers.prepare import Prepared, Source
-from benchmarks.trainers.trials import TRIALS, Job, Trial
+from benchmarks.trainers.trials import TRIALS, Trial
 from d2_plugin.errors import D2Error
 from d2_plugin.protocol import View
 from d2_plugin.recordings import open_recording
 from d2_plugin.viewing.rendering import RenderedView
 
 TESTS = Path(__file__).parents[1]
-
-
-def job(folder: Path) -> Job:
-    folder.mkdir(exist_ok=True)
-    return Job(folder / "data", folder, iterations=200, frames=5, seconds=0.25)
 
 
 def row(method: str, psnr: dict, seed: int | None = 0, **more: object) -> dict:
@@ -114,20 +109,6 @@ def test_instants_between_are_asked_for_in_the_trainers_own_time(
 def test_a_trainer_whose_time_is_not_known_is_not_asked_between(tmp_path: Path) -> None:
     with pytest.raises(D2Error, match="gsplat is not scored between instants: give --only fudan, hust4d, spacetime"):
         list(rows_of("gsplat", TrainersBench(tmp_path, (tmp_path,), hold_out_instants=2)))
-
-
-class TestTrials:
-    @pytest.mark.parametrize("own", [False, True])
-    @pytest.mark.parametrize("name", TRIALS)
-    def test_its_script_is_told_data_length_place_and_schedule(self, name: str, own: bool, tmp_path: Path) -> None:
-        asked = replace(job(tmp_path), own_schedules=own)
-        words = TRIALS[name].words(asked)
-        told = " ".join([*words, *(path.read_text() for path in tmp_path.iterdir() if path.is_file())])
-        assert str(asked.data) in told
-        assert str(asked.model) in told
-        assert "200" in told
-        assert not asked.model.exists(), "4C4D refuses a folder that is there"
-        assert own != any(name in told for name in ("densify_from_iter", "strategy.refine_start_iter"))
 
 
 TRAIN = """
