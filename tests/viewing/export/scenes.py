@@ -67,18 +67,14 @@ def make_scene(
     return export_scene(ViewedRun(name, recording, tuple(train), (held_out,), make_adapter(model)))
 
 
-def rasterized(
-    model: SplatModel, camera: int, time: float, turned: torch.Tensor | None = None, finer: int = 1
-) -> dict[str, np.ndarray]:
+def rasterized(model: SplatModel, camera: int, time: float, finer: int = 1) -> dict[str, np.ndarray]:
     """What our rasterizer draws: color [H, W, 3] in 0..1, expected depth and alpha [H, W].
 
-    `turned` [4, 4] takes the camera's axes to those of another camera at its place; images have `finer` times as many
-    pixels each way."""
+    Images have `finer` times as many pixels each way."""
     view = larger(make_views()[camera])
     K = view.K * torch.tensor([[finer], [finer], [1.0]])
-    T_camera_world = view.T_camera_world if turned is None else turned @ view.T_camera_world
     with torch.no_grad():
-        render = model.render(View(view.camera, 0, time, T_camera_world, K, finer * WIDTH, finer * HEIGHT))
+        render = model.render(View(view.camera, 0, time, view.T_camera_world, K, finer * WIDTH, finer * HEIGHT))
     depth = render.depth_sum / render.alpha.clamp(min=1e-4)
     return {"color": render.color.clamp(0, 1).numpy(), "depth": depth.numpy(), "opacity": render.alpha.numpy()}
 
