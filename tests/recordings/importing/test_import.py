@@ -15,9 +15,8 @@ from d2_plugin.recordings.cameras.camera import CalibratedCamera
 from d2_plugin.recordings.cameras.lens import Lens
 from d2_plugin.recordings.importing.importing import import_videos
 from d2_plugin.recordings.importing.settings import ImportSettings
-from d2_plugin.recordings.importing.source import MOMENTS, Cut, VideosSource
+from d2_plugin.recordings.importing.source import Cut, VideosSource
 from d2_plugin.recordings.importing.steps import KIND
-from d2_plugin.recordings.importing.video import Decoder
 from d2_plugin.recordings.selection import select_frames
 
 pytest.importorskip("av")
@@ -44,24 +43,10 @@ def filmed(plaza: Recording, tmp_path_factory: pytest.TempPathFactory) -> Filmed
 
 
 @pytest.fixture(scope="module")
-def decoded(filmed: Filmed) -> tuple[Path, list[tuple[str, int]]]:
-    """An import whose images stay in the videos, and every frame of a camera that it decoded."""
-    asked: list[tuple[str, int]] = []
-    frame_of = Decoder._frame
-
-    def counted(self: Decoder, index: int) -> object:
-        asked.append((self.video.path.stem, index))
-        return frame_of(self, index)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Decoder, "_frame", counted)
-        import_videos(settings_of(filmed, filmed.folder / "recording", images="videos"))
-    return filmed.folder / "recording", asked
-
-
-@pytest.fixture(scope="module")
-def imported(decoded: tuple[Path, list]) -> Path:
-    return decoded[0]
+def imported(filmed: Filmed) -> Path:
+    """An import whose images stay in the videos."""
+    import_videos(settings_of(filmed, filmed.folder / "recording", images="videos"))
+    return filmed.folder / "recording"
 
 
 def settings_of(filmed: Filmed, folder: Path, **more: object) -> ImportSettings:
@@ -114,13 +99,6 @@ def test_images_that_stay_in_the_videos_are_the_same_as_written_ones(filmed: Fil
             assert (opened.image(name, frame) == written.image(name, frame)).all()
     some = select_frames(select_cameras(opened, ["03"]), opened.frames[:2])
     assert some.seconds(0, "03") == pytest.approx(written.seconds(0, "03"), abs=1e-4)
-
-
-def test_what_is_checked_is_decoded_once(decoded: tuple) -> None:
-    """Sound is the clock and nothing is written: one look at the calibration, then each moment once."""
-    asked = decoded[1]
-    assert len(asked) <= (1 + MOMENTS) * len(NAMES)
-    assert max(map(asked.count, asked)) <= 2
 
 
 def test_the_commands_and_a_stopped_import_goes_on(filmed: Filmed, tmp_path: Path, answered, monkeypatch) -> None:
