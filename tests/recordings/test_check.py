@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from prior_cases import world_points
 from refusals import refuses
 
 from d2_plugin.errors import D2Error
@@ -140,12 +141,9 @@ CAMERAS = ("train0", "train1", "train2")
 def wide_room() -> tuple[Recording, np.ndarray, np.ndarray]:
     """A recording and surface points seen in its first image, some of them hidden from the others."""
     recording = synthetic_recording(cameras=4, frames=2, width=160, height=90)
-    camera, depth = recording.cameras["train1"], recording.depth("train1", 0)
-    rows, columns = np.mgrid[3:87:4, 3:157:4].reshape(2, -1)
-    rays = np.stack([columns + 0.5, rows + 0.5, np.ones(len(rows))], -1) @ np.linalg.inv(camera.K).T
-    points = rays * depth[rows, columns, None]
-    world = (points - camera.T_camera_world[:3, 3]) @ camera.T_camera_world[:3, :3]
-    return recording, world, np.zeros(len(world))
+    world = world_points(recording.cameras["train1"], recording.depth("train1", 0)).reshape(90, 160, 3)
+    points = world[3:87:4, 3:157:4].reshape(-1, 3)
+    return recording, points, np.zeros(len(points))
 
 
 def exposed(recording: Recording, gains: dict[str, tuple[float, float, float]]) -> SimpleNamespace:

@@ -2,10 +2,12 @@
 
 import numpy as np
 import pytest
+from prior_cases import world_points
 from refusals import refuses
 
 from benchmarks.priors_motion import scene_flow
-from d2_plugin.recordings.recording import Camera, Recording
+from d2_plugin.priors.geometry import projected
+from d2_plugin.recordings.recording import Recording
 from d2_plugin.recordings.synthetic.raycast import render_depth
 from d2_plugin.recordings.synthetic.room import furnished_room, synthetic_recording
 
@@ -15,29 +17,14 @@ def recording() -> Recording:
     return synthetic_recording(frames=6, width=120, height=68)
 
 
-def world_points(camera: Camera, depth: np.ndarray) -> np.ndarray:
-    """World point [H * W, 3] of every pixel centre at its planar depth."""
-    v, u = np.mgrid[: camera.height, : camera.width] + 0.5
-    pixels = np.stack([u, v, np.ones_like(u)], axis=-1).reshape(-1, 3)
-    in_camera = pixels @ np.linalg.inv(camera.K).T * depth.reshape(-1, 1)
-    return (in_camera - camera.T_camera_world[:3, 3]) @ camera.T_camera_world[:3, :3]
-
-
-def projected(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Columns, rows and planar depths of world points [n, 3]."""
-    in_camera = points @ camera.T_camera_world[:3, :3].T + camera.T_camera_world[:3, 3]
-    u, v, depth = (in_camera @ camera.K.T).T
-    return u / depth, v / depth, depth
-
-
 def test_what_moves_is_seen_later_where_its_scene_flow_says(recording: Recording) -> None:
     """Points of a frame and their flow: never in front of the depth of a later frame, mostly on it; walls stand."""
     camera, flow = recording.cameras["train1"], scene_flow(recording.source, "train1", 0, 3).reshape(-1, 3)
     moves = np.linalg.norm(flow, axis=1) > 1e-6
     assert 0.01 < moves.mean() < 0.3
     moved = (world_points(camera, recording.depth("train1", 0)) + flow)[moves]
-    u, v, depth = projected(camera, moved)
-    ratio = depth / recording.depth("train1", 3)[v.astype(int), u.astype(int)]
+    pixels, depth, _ = projected(camera, moved)
+    ratio = depth / recording.depth("train1", 3)[tuple(pixels.astype(int).T[::-1])]
     assert np.mean(np.abs(ratio - 1) < 0.02) > 0.7, "what turns away is not seen any more"
     assert np.mean(ratio < 0.97) < 0.1  # only at silhouettes, by up to a pixel
     np.testing.assert_allclose(scene_flow(recording.source, "train1", 2, 2), 0, atol=1e-6)

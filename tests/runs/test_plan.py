@@ -6,11 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from prior_cases import showing
+from prior_cases import showing, world_points
 from refusals import refuses
 
 from d2_plugin.errors import D2Error
-from d2_plugin.priors.geometry import viewing_rays
 from d2_plugin.priors.settings import PriorSettings, StereoSettings
 from d2_plugin.priors.stereo import matched_depth
 from d2_plugin.protocol import Label
@@ -173,9 +172,7 @@ def test_images_without_texture_have_no_stereo_and_the_reason_says_so(moving) ->
 def test_a_colmap_model_brings_the_points_that_tell_the_depths(moving, tmp_path: Path) -> None:
     undeclared = {name: replace(c, near_far=None) for name, c in moving.cameras.items()}
     still = replace(select_frames(moving, [0]), cameras=undeclared)
-    depth, first = still.depth("train0", 0), still.cameras["train0"]
-    in_camera = (viewing_rays(first, np.float64) * depth[..., None]).reshape(-1, 3)[::37]
-    points = (in_camera - first.T_camera_world[:3, 3]) @ first.T_camera_world[:3, :3]
+    points = world_points(still.cameras["train0"], still.depth("train0", 0))[::37]
     cloud = PointCloud(points, np.full(points.shape, 0.5))
     model = open_recording(export_recording(still, "colmap", tmp_path / "model", cloud=cloud))
     assert "depths unknown" not in plan_scene(model, PAIR, None).as_dict()["stereo"]["reason"]
