@@ -13,10 +13,10 @@ from typing import Annotated, Optional
 
 import pytest
 from mimics.workplace import furnish
+from refusals import refuses
 
 from d2_plugin import older, registry
 from d2_plugin.config import D2Config
-from d2_plugin.errors import D2Error
 from d2_plugin.hooks import HOOKS
 from d2_plugin.settings import Range, Settings, declared
 
@@ -150,13 +150,12 @@ class TestAnnotations:
         class Old(Settings):
             share: Optional[Annotated[float, Range(0, 1)]] = None  # noqa: UP045  as the stand-in evaluates it
 
-        with pytest.raises(D2Error, match=r"Old.share"):
-            Old(share=2.0)
+        refuses(r"Old.share", Old, share=2.0)
         assert declared(Old)[0].default is None
 
     def test_a_missing_stand_in_is_named_with_its_command(self) -> None:
-        with pytest.raises(D2Error, match=r"cannot read TOML by itself: run `pip install tomli`"):
-            older.stand_in("no_such_module", "tomli", "read TOML")
+        says = r"cannot read TOML by itself: run `pip install tomli`"
+        refuses(says, older.stand_in, "no_such_module", "tomli", "read TOML")
 
 
 def test_entry_points_are_found_in_the_shape_of_python_3_9(monkeypatch: pytest.MonkeyPatch) -> None:
