@@ -135,16 +135,6 @@ def test_angles_that_cannot_be_matched_are_no_overlap() -> None:
     assert max(measure_overlap(still, StereoSettings()).shares) == 0
 
 
-def test_unknown_depths_give_the_most_that_could_be_seen() -> None:
-    found = measure_overlap([camera("a", 0, 10), camera("b", 0.5, -10)], StereoSettings())
-    assert not found.depth_known
-    assert min(found.shares) > 0.9  # from some depth on, each pixel lies in the other image
-    assert found.angles == pytest.approx((20, 20))
-    apart = measure_overlap([camera("a", 0, -90), camera("b", 0.5, 90)], StereoSettings())
-    assert apart.shares == (0, 0)
-    assert apart.angles == ()
-
-
 def rig(recording: Recording, *cameras: Camera) -> Recording:
     """The recording with other cameras for train0 and train1; its images stay."""
     sized = [replace(c, width=96, height=54, K=pinhole(96, 96, 48, 27)) for c in cameras]
