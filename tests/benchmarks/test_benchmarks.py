@@ -8,8 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 
 from benchmarks import memory, scaling
 from benchmarks.__main__ import PARTS, main
@@ -23,7 +21,7 @@ from benchmarks.report import EVERY
 from benchmarks.stability.gaussians import difference, random_rotation, random_scene, render, turned
 from benchmarks.stability.sweep import run_sweeps
 from benchmarks.stereo_measure import score
-from benchmarks.work_precision import means, pareto_front, work_precision
+from benchmarks.work_precision import means, work_precision
 from d2_plugin.commands.cli import main as d2
 from d2_plugin.priors.declared_error import NORMAL_SHARE, frames_with_truth, reliability_curve
 from d2_plugin.priors.settings import PriorSettings
@@ -95,13 +93,6 @@ def test_a_step_of_the_proof_on_a_gpu_calls_a_part_with_words_that_the_part_take
 
 def measured(method: str, setting: str, error: float | None, seconds: float | None, failed: str | None = None) -> Row:
     return make_row("stereo", "rig", method, setting, error=error, seconds=seconds, failed=failed)
-
-
-@given(st.lists(st.tuples(st.floats(0, 1e9), st.floats(0, 1e9)), max_size=30))
-def test_every_point_off_the_front_is_beaten_by_one_on_it_and_none_of_the_front_is(points: list) -> None:
-    front = [points[i] for i in pareto_front(points)]
-    assert all(any(x <= p[0] and y <= p[1] for x, y in front) for p in points)
-    assert not any(a != b and a[0] <= b[0] and a[1] <= b[1] for a in front for b in front)
 
 
 def test_means_over_cases_are_geometric_and_failures_keep_a_setting_off_the_front() -> None:
