@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from refusals import refuses
+from stand_in_recordings import Smooth
 from viewing.export.scenes import psnr
 
 from d2_plugin.durable import write_table
@@ -172,14 +173,8 @@ def test_a_run_that_still_trains_and_has_no_prior_is_shown_with_a_note(bare, tmp
 
 
 def soft(count: int, width: int, height: int) -> list[np.ndarray]:
-    """Smooth colours with a bar that moves."""
-    y, x = np.mgrid[:height, :width]
-    base = np.stack([255 * x / width, 255 * y / height, np.full_like(x, 90)], -1)
-    images = []
-    for i in range(count):
-        bar = np.exp(-(((x - width * i / count) / (width / 12)) ** 2))[..., None]
-        images.append(np.clip(base * (1 - bar) + 230 * bar, 0, 255).astype(np.uint8))
-    return images
+    """Smooth colours with a spot that moves."""
+    return [Smooth(width, height).image("a", frame) for frame in range(count)]
 
 
 def write(path: Path, images: list[np.ndarray], fps: float = 30, form: str = "mp4") -> None:
