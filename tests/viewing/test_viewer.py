@@ -133,14 +133,11 @@ class TestWhoOnlyLooks:
         assert len(drawn) > 1
         return sum(drawn) / clock.now
 
-    @pytest.mark.parametrize("seconds", [0.001, 0.1])
-    def test_images_keep_to_their_share(self, viewed: ViewedRun, monkeypatch, seconds: float) -> None:
-        share = self.spent_on_images(viewed, monkeypatch, seconds, moves=False)
-        assert 0.5 * WATCHED < share < 1.1 * WATCHED + seconds / (self.STEPS * self.SECONDS_OF_A_STEP)
-
-    def test_who_moves_gets_more(self, viewed: ViewedRun, monkeypatch: pytest.MonkeyPatch) -> None:
-        share = self.spent_on_images(viewed, monkeypatch, 0.02, moves=True)
-        assert 2 * WATCHED < share < 1.1 * MOVED
+    @pytest.mark.parametrize(("seconds", "moves"), [(0.001, False), (0.1, False), (0.02, True)])
+    def test_images_keep_to_their_share_and_who_moves_gets_more(self, viewed, monkeypatch, seconds, moves) -> None:
+        share, one = self.spent_on_images(viewed, monkeypatch, seconds, moves), seconds / self.STEPS / 0.01
+        least, most = (2 * WATCHED, 1.1 * MOVED) if moves else (0.5 * WATCHED, 1.1 * WATCHED + one)
+        assert least < share < most
 
 
 def test_d2_knows_which_gaussians_it_inserted_across_all_edits_and_a_resume() -> None:
