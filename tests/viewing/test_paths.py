@@ -28,17 +28,15 @@ def focus(cameras: list[Camera]) -> np.ndarray:
     return focus_of(np.stack([c.centre for c in cameras]), np.stack([c.T_camera_world[2, :3] for c in cameras]))
 
 
-def is_rotation(R: np.ndarray) -> bool:
-    return np.allclose(R @ R.T, np.eye(3), atol=1e-9) and np.linalg.det(R) > 0
-
-
 @pytest.mark.parametrize("cameras", [ARC, ARC[:2], ARC[:1], ring(8)], ids=["arc", "two", "one", "ring"])
 def test_every_pose_of_an_orbit_is_a_camera_pose(cameras: list[Camera]) -> None:
     poses = orbit(cameras, 17)
     assert len(poses) == 17
     for pose in poses:
+        R = pose.T_camera_world[:3, :3]
         assert np.isfinite(pose.T_camera_world).all()
-        assert is_rotation(pose.T_camera_world[:3, :3])
+        assert np.allclose(R @ R.T, np.eye(3), atol=1e-9)
+        assert np.linalg.det(R) > 0
 
 
 def test_an_orbit_looks_at_the_focus_from_one_distance_and_stays_inside_the_cameras() -> None:

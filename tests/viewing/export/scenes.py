@@ -5,6 +5,7 @@ import torch
 from tiny import make_adapter, make_model, make_views
 
 from d2_plugin.backbones.model import SplatModel
+from d2_plugin.backbones.yang4d import Yang4D, Yang4DSettings
 from d2_plugin.protocol import View
 from d2_plugin.recordings import Camera, Recording
 from d2_plugin.viewing.export.scene import ExportScene, export_scene
@@ -39,6 +40,19 @@ def sharp_model(backbone: str, count: int = 400, **options: object) -> SplatMode
             for plane in model.field.time:
                 plane += 0.3 * torch.randn(plane.shape, generator=generator)
             model.field.heads.weight.normal_(0, 0.2, generator=generator)
+    return model
+
+
+def with_harmonics(count: int = 400, in_time: bool = False) -> SplatModel:
+    """4D Gaussians whose colours differ by direction and, `in_time`, by time, before a sky."""
+    plain, degree, generator = sharp_model("yang4d", count), 2 if in_time else 0, torch.Generator().manual_seed(3)
+    rows = {name: value.detach() for name, value in plain.gaussians.parameters.items()}
+    rows["harmonics"] = 0.2 * torch.randn(count, 16 * (degree + 1) - 1, 3, generator=generator)
+    chosen = Yang4DSettings(sh_degree=3, sh_time_degree=degree, background=in_time)
+    model = Yang4D(rows, chosen, 2.0, DURATION)
+    if in_time:
+        with torch.no_grad():
+            model.background.harmonics.normal_(0, 0.2, generator=generator)
     return model
 
 

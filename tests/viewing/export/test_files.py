@@ -12,9 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles.export_files import ReadPage, covariances_from, covariances_of, read_still_ply
 from refusals import refuses
-from viewing.export.scenes import DURATION, make_scene, sharp_model
+from viewing.export.scenes import DURATION, make_scene, sharp_model, with_harmonics
 
-from d2_plugin.backbones.yang4d import Yang4D, Yang4DSettings
 from d2_plugin.gaussians.moving import Harmonics, LinearMotion, MovingGaussians
 from d2_plugin.gaussians.slicing import slice_gaussians
 from d2_plugin.gaussians.spherical_harmonics import SH_C0
@@ -29,14 +28,6 @@ from d2_plugin.viewing.export.page import to_json, write_page
 from d2_plugin.viewing.export.ply import scales_and_rotations, write_ply
 
 TIMES = (0.0, 0.13, 0.5)
-
-
-def with_harmonics(count: int) -> Yang4D:
-    """4D Gaussians with harmonics of degree 3."""
-    plain = sharp_model("yang4d", count)
-    rows = {name: value.detach() for name, value in plain.gaussians.parameters.items()}
-    rows["harmonics"] = 0.2 * torch.randn(len(plain), 15, 3, generator=torch.Generator().manual_seed(3))
-    return Yang4D(rows, Yang4DSettings(sh_degree=3, background=False), 2.0, DURATION)
 
 
 class TestStraightLines:

@@ -10,10 +10,9 @@ import pytest
 import torch
 from oracles.export_files import ReadPage
 from viewing.chromium import Page, browser, executable, image
-from viewing.export.scenes import DURATION, NASTY, make_scene, psnr, rasterized, sharp_model
+from viewing.export.scenes import DURATION, NASTY, make_scene, psnr, rasterized, sharp_model, with_harmonics
 
 from d2_plugin.backbones.model import SplatModel
-from d2_plugin.backbones.yang4d import Yang4D, Yang4DSettings
 from d2_plugin.runs.drawing import color_scale, colorize
 from d2_plugin.viewing.export.page import write_page
 
@@ -72,23 +71,11 @@ def moving(new_page: Callable[[], Page], folder: Path) -> Page:
     return opened(new_page(), sharp_model("yang4d"), folder / "moving.html")
 
 
-def with_harmonics_in_time() -> SplatModel:
-    """Colours that differ by direction and time, before a sky."""
-    plain = sharp_model("yang4d")
-    rows = {name: value.detach() for name, value in plain.gaussians.parameters.items()}
-    generator = torch.Generator().manual_seed(3)
-    rows["harmonics"] = 0.2 * torch.randn(len(plain), 47, 3, generator=generator)
-    model = Yang4D(rows, Yang4DSettings(sh_degree=3, sh_time_degree=2, background=True), 2.0, DURATION)
-    with torch.no_grad():
-        model.background.harmonics.normal_(0, 0.2, generator=generator)
-    return model
-
-
 MODELS: dict[str, tuple[Callable[[], SplatModel], float]] = {
     "4D Gaussians": (lambda: sharp_model("yang4d"), 45.0),
     "deformation field": (lambda: sharp_model("deform"), 28.0),
     "one instant": (lambda: sharp_model("yang4d", temporal=False), 45.0),
-    "harmonics and cosines in time": (with_harmonics_in_time, 30.0),
+    "harmonics and cosines in time": (lambda: with_harmonics(in_time=True), 30.0),
 }
 """Models by name with the least agreement in dB: a baked field is straight between its keys.
 
