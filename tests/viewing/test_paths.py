@@ -54,7 +54,7 @@ def test_an_orbit_looks_at_the_focus_from_one_distance_and_stays_inside_the_came
 
 def test_cameras_all_around_are_orbited_by_a_whole_turn() -> None:
     poses = orbit(ring(8), 36)
-    assert all(pose.T_camera_world[1, 1] > 0 for pose in poses), "upright"
+    assert all(one.T_camera_world[1, 1] > 0 for one in (*ring(8), *poses)), "upright"
     places = np.stack([pose.centre for pose in poses])
     assert np.allclose(np.linalg.norm(places, axis=1), 3)
     assert np.allclose(places.mean(axis=0), 0, atol=1e-9)
