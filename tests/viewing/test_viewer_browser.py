@@ -7,7 +7,6 @@ from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
 import pytest
 from tiny import ALL_HOOKS, make_trainer
 from viewing.chromium import Page, browser, decoded, executable
@@ -50,16 +49,12 @@ def opened(new_page: Callable[[], Page], viewer: Viewer) -> Page:
     return page
 
 
-def image(page: Page) -> np.ndarray:
-    return decoded(page.page.screenshot(clip=FREE)).astype(float)
-
-
-def until(page: Page, condition: Callable[[np.ndarray], bool], seconds: float = 30) -> np.ndarray:
-    """The first image that fulfils a condition."""
-    for _ in range(int(seconds / 0.25)):
+def wait_for_image(page: Page) -> None:
+    """Until something is drawn where neither controls nor notices are."""
+    for _ in range(120):
         page.page.wait_for_timeout(250)
-        if condition(found := image(page)):
-            return found
+        if decoded(page.page.screenshot(clip=FREE)).std() > 2:
+            return
     raise AssertionError("the page never showed it")
 
 
@@ -105,7 +100,7 @@ def test_a_training_is_watched_paused_and_goes_on(new_page: Callable[[], Page]) 
     thread.start()
     try:
         page = opened(new_page, viewer)
-        until(page, lambda now: now.std() > 2)
+        wait_for_image(page)
         assert "Gaussians" in control(page, "step").input_value()
         assert "inserted" in control(page, "score").input_value()
         page.page.get_by_role("button", name="Pause", exact=True).click()
