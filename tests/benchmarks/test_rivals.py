@@ -17,15 +17,13 @@ from benchmarks.rivals.pearson import pearson_depth_loss
 from benchmarks.rivals.scale_shift import scale_shift_loss
 from benchmarks.rivals.sparse_points import Seen, sparse_point_loss
 from benchmarks.rivals.sweep import best_change
-from benchmarks.rivals.table import RIVAL_PRESETS, RIVALS, guidance
+from benchmarks.rivals.table import RIVAL_PRESETS, RIVALS
 from d2_plugin import D2Config, D2Hooks
 from d2_plugin.errors import D2Error
 from d2_plugin.hooks import Hook, HookConfig
 from d2_plugin.runs.ablation.ablate import ablate
 from d2_plugin.runs.ablation.presets import PRESETS, rows_named
 from d2_plugin.runs.rows import read_rows
-from d2_plugin.runs.run import Run
-from d2_plugin.runs.saved import read_run
 from d2_plugin.runs.settings import RunSettings
 
 RNG = np.random.default_rng(7)
@@ -136,58 +134,26 @@ def test_where_nothing_can_be_told_there_is_no_gradient(name: str, dtype: torch.
     assert (d.grad == 0).all()
 
 
-@pytest.fixture(scope="module")
-def room(saved_room: Callable[..., Path]) -> Path:
-    return saved_room(cameras=2, held_out=1, frames=2, width=96, height=54)
-
-
-@pytest.fixture(scope="module")
-def ablation(room: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def test_every_rival_trains_on_one_prior_and_says_its_name(saved_room: Callable[..., Path], tmp_path: Path) -> None:
     pytest.importorskip("pycolmap", reason="pycolmap is in the `stereo` extra")
-    pytest.importorskip("cv2", reason="opencv is in the `image` extra")
-    output = tmp_path_factory.mktemp("ablation") / "out"
-    base = RunSettings(str(room), ("train0", "train1"), iterations=24)
+    room = saved_room(cameras=2, held_out=1, frames=2, width=96, height=54)
     presets = rows_named(["backbone", *RIVALS, "full"], PRESETS | RIVAL_PRESETS)
     with measured_at_once():
-        ablate(base, presets, ["yang4d"], [0], output, 1, "")
-    return output
+        ablate(RunSettings(str(room), ("train0", "train1"), iterations=24), presets, ["yang4d"], [0], tmp_path, 1, "")
+    rows = read_rows([tmp_path / "runs.jsonl"])
+    assert {row["method"].removeprefix("yang4d ") for row in rows} == {"backbone", *RIVALS, "full"}
+    assert [path.name for path in (tmp_path / "priors").iterdir() if path.is_dir()] == ["dual"]
+    for name in RIVALS:
+        metrics = json.loads((tmp_path / "yang4d" / name / "seed0" / "metrics.json").read_text())
+        assert metrics["guidance"]["name"] == name
+        assert metrics["cpu_seconds"]["train"] > 0
 
 
-def folder_of(output: Path, method: str) -> Path:
-    return output / "yang4d" / method / "seed0"
-
-
-def run_of(output: Path, name: str) -> Run:
-    stored = read_run(folder_of(output, name))
-    rival = guidance(stored.pop("guidance")["name"], 24)
-    return Run(RunSettings.from_table(stored, "run.json"), folder_of(output, name), rival)
-
-
-class TestOnARecording:
-    def test_every_rival_trains_on_one_prior_and_says_its_name(self, ablation: Path) -> None:
-        rows = [json.loads(line) for line in (ablation / "runs.jsonl").read_text().splitlines()]
-        assert {row["method"].removeprefix("yang4d ") for row in rows} == {"backbone", *RIVALS, "full"}
-        assert [path.name for path in (ablation / "priors").iterdir() if path.is_dir()] == ["dual"]
-        for name in RIVALS:
-            metrics = json.loads((folder_of(ablation, name) / "metrics.json").read_text())
-            assert metrics["guidance"]["name"] == name
-            assert metrics["cpu_seconds"]["train"] > 0
-
-    def test_a_dense_start_adds_stereo_points_to_the_triangulated_ones(self, ablation: Path) -> None:
-        run = run_of(ablation, "dense_start")
-        points = run.prepare()
-        started = guidance("dense_start", 24).start(run.scene, points, run.priors)
-        assert len(points) + 300 < len(started) <= len(points) + 0.18 * 96 * 54 + 6  # each of four images rounds
-        np.testing.assert_array_equal(started.positions[: len(points)], points.positions)
-        assert set(started.times) == {0.0, run.scene.recording.seconds(1)}
-
-
-class TestAtTheirBest:
-    @pytest.mark.parametrize("name", RIVALS)
-    def test_the_best_is_that_of_the_sweep(self, name: str) -> None:
-        """No weight of a table is chosen by hand."""
-        rows = read_rows([Path(__file__).parents[2] / "docs" / "results" / "rivals-sweep.jsonl"])
-        assert str(RIVALS[name].best) == best_change(rows, name)
+@pytest.mark.parametrize("name", RIVALS)
+def test_the_best_of_a_rival_is_that_of_the_sweep(name: str) -> None:
+    """No weight of a table is chosen by hand."""
+    rows = read_rows([Path(__file__).parents[2] / "docs" / "results" / "rivals-sweep.jsonl"])
+    assert str(RIVALS[name].best) == best_change(rows, name)
 
 
 def test_a_hook_of_ones_own_does_not_take_the_name_of_one_of_d2s() -> None:
