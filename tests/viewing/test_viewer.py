@@ -98,46 +98,29 @@ def test_one_line_shows_any_trainer_and_training_stays_bitwise_the_same() -> Non
     assert watched.d2.step.__func__ is type(watched.d2).step, "closed, it lets go of the trainer"
 
 
-class Clock:
-    """Seconds that pass only where a test says so."""
+@pytest.mark.parametrize(("seconds", "moves"), [(0.001, False), (0.1, False), (0.02, True)])
+def test_images_take_a_twentieth_of_the_time_of_a_training_and_more_for_who_moves(
+    viewed: ViewedRun, monkeypatch: pytest.MonkeyPatch, seconds: float, moves: bool
+) -> None:
+    """Images of so many seconds each, in a thousand steps of a hundredth of a second."""
+    clock, client, drawn = SimpleNamespace(now=0.0), looker(), []
+    clock.monotonic = lambda: clock.now
+    monkeypatch.setattr("d2_plugin.viewing.live.viewer.time", clock)
 
-    def __init__(self) -> None:
-        self.now = 0.0
+    def draw(*_: object) -> None:
+        clock.now += seconds
+        drawn.append(seconds)
 
-    def monotonic(self) -> float:
-        return self.now
-
-
-class TestWhoOnlyLooks:
-    """Images take a twentieth of the time of a training that somebody only looks at."""
-
-    STEPS, SECONDS_OF_A_STEP = 1000, 0.01
-
-    def spent_on_images(self, viewed: ViewedRun, patch: pytest.MonkeyPatch, seconds: float, moves: bool) -> float:
-        """Share of the whole time that images of `seconds` each take."""
-        clock, drawn = Clock(), []
-        patch.setattr("d2_plugin.viewing.live.viewer.time", clock)
-        client = looker()
-        with closing(Viewer(viewed=viewed, port=PORT, height=48, iterations=self.STEPS)) as viewer:
-
-            def draw(*_: object) -> None:
-                clock.now += seconds
-                drawn.append(seconds)
-
-            patch.setattr("d2_plugin.viewing.live.viewer.draw", draw)
-            viewer._connected(client)
-            for step in range(self.STEPS):
-                clock.now += self.SECONDS_OF_A_STEP
-                client.camera.position = np.full(3, step * moves)
-                viewer.after_step(step)
-        assert len(drawn) > 1
-        return sum(drawn) / clock.now
-
-    @pytest.mark.parametrize(("seconds", "moves"), [(0.001, False), (0.1, False), (0.02, True)])
-    def test_images_keep_to_their_share_and_who_moves_gets_more(self, viewed, monkeypatch, seconds, moves) -> None:
-        share, one = self.spent_on_images(viewed, monkeypatch, seconds, moves), seconds / self.STEPS / 0.01
-        least, most = (2 * WATCHED, 1.1 * MOVED) if moves else (0.5 * WATCHED, 1.1 * WATCHED + one)
-        assert least < share < most
+    with closing(Viewer(viewed=viewed, port=PORT, height=48, iterations=1000)) as viewer:
+        monkeypatch.setattr("d2_plugin.viewing.live.viewer.draw", draw)
+        viewer._connected(client)
+        for step in range(1000):
+            clock.now += 0.01
+            client.camera.position = np.full(3, step * moves)
+            viewer.after_step(step)
+    assert len(drawn) > 1
+    least, most = (2 * WATCHED, 1.1 * MOVED) if moves else (0.5 * WATCHED, 1.1 * WATCHED + seconds / 10)
+    assert least < sum(drawn) / clock.now < most
 
 
 def test_d2_knows_which_gaussians_it_inserted_across_all_edits_and_a_resume() -> None:
