@@ -29,8 +29,6 @@ OUTSIDE = ("d2_plugin.priors", "d2_plugin.recordings", "d2_plugin.runs", "d2_plu
 NOT_NEEDED = ("cv2", "pycolmap", "onnxruntime", "rich", "matplotlib")
 """Packages that training does without; a bare import needs neither these nor torch and numpy."""
 
-BARE = "import sys, d2_plugin; print(*sys.modules)"
-
 ATTACHED = f"""
 import sys
 for name in {NOT_NEEDED}:
@@ -99,7 +97,7 @@ def trainer(tmp_path_factory: pytest.TempPathFactory) -> list[list[str]]:
 
 
 def test_importing_the_plugin_imports_nothing_else() -> None:
-    [names] = printed(BARE)
+    [names] = printed("import sys, d2_plugin; print(*sys.modules)")
     assert [name for name in names if name.startswith("d2_plugin")] == ["d2_plugin"]
     assert not {"torch", "numpy", *NOT_NEEDED} & set(names)
 

@@ -323,22 +323,19 @@ class TestRefused:
         refuses(said, open_viewed, tmp_path / "a.pth", room)
 
 
-class TestExport:
-    """`d2 export` of a checkpoint: straight lines exactly where it has them, baked key times where not."""
-
-    def test_4d_gaussians_become_the_same_straight_lines(self, room: Path, tmp_path: Path, answered) -> None:
-        path = tmp_path / "chkpnt30000.pth"
-        model = TestTuples.checkpoint(path)
-        said = answered("export", str(path), "--recording", str(room), "--train-cameras", "train0,train1")
-        assert "times are taken to be seconds since the first frame" in said
-        assert "moves on a straight line and fades in time, exactly as it was trained" in said
-        page = ReadPage(tmp_path / "export" / "scene.html")
-        assert [camera["held_out"] for camera in page.header["cameras"]] == [False, False, True, True]
-        for time in (0.0, 0.1, 0.25):
-            true = FudanAdapter(model).slice_at(seen(open_viewed(path, room), time))
-            told = page.at(time)
-            drawn = told.positions[told.opacities >= 1 / 255]
-            assert torch.cdist(true.means[true.opacities >= 1 / 255].double(), drawn).amin(1).max() < 1e-3
+def test_an_exported_checkpoint_of_4d_gaussians_has_the_same_lines(room: Path, tmp_path: Path, answered) -> None:
+    path = tmp_path / "chkpnt30000.pth"
+    model = TestTuples.checkpoint(path)
+    said = answered("export", str(path), "--recording", str(room), "--train-cameras", "train0,train1")
+    assert "times are taken to be seconds since the first frame" in said
+    assert "moves on a straight line and fades in time, exactly as it was trained" in said
+    page = ReadPage(tmp_path / "export" / "scene.html")
+    assert [camera["held_out"] for camera in page.header["cameras"]] == [False, False, True, True]
+    for time in (0.0, 0.1, 0.25):
+        true = FudanAdapter(model).slice_at(seen(open_viewed(path, room), time))
+        told = page.at(time)
+        drawn = told.positions[told.opacities >= 1 / 255]
+        assert torch.cdist(true.means[true.opacities >= 1 / 255].double(), drawn).amin(1).max() < 1e-3
 
 
 @pytest.mark.parametrize("name", ["hust4d", "swift4d"])

@@ -267,11 +267,9 @@ class TestTheFreeCamera:
         assert (time, moved) == (before[1], True)
 
 
-PHONE = {"viewport": {"width": 390, "height": 844}, "has_touch": True, "is_mobile": True}
-
-
 def test_a_phone_has_one_row_of_controls_large_enough_and_an_image_without_what_nobody_recorded(compared: Page) -> None:
-    context = compared.page.context.browser.new_context(**PHONE)
+    phone = {"viewport": {"width": 390, "height": 844}, "has_touch": True, "is_mobile": True}
+    context = compared.page.context.browser.new_context(**phone)
     page = begun(Page(context.new_page()), compared.page.url)
     boxes = [page.page.locator(f"#{name}").bounding_box() for name in ("play", "time", "camera", "more")]
     assert max(box["y"] for box in boxes) - min(box["y"] for box in boxes) < 2, "one row"
