@@ -216,7 +216,7 @@ class TestBoards:
         refuses("saw 0 sides of the board's squares .* show", scaled_by_board, rig, half, replace(board, marker=None))
 
     def test_words_are_a_board_or_refused(self) -> None:
-        for text in ("", "charuco:7x5:0.04", "charuco:7x5:0.03:0.04", "checkerboard:9x6:-1", "chess:9x6:0.1"):
+        for text in ("", "a4", "charuco:7x5:0.04", "charuco:7x5:0.03:0.04", "checkerboard:9x6:-1", "chess:9x6:0.1"):
             refuses("expected charuco:COLUMNSxROWS:SQUARE:MARKER", Board.parsed, text)
         assert Board.parsed("charuco:7x5:0.04:0.03:DICT_5X5_50") == Board(7, 5, 0.04, 0.03, "DICT_5X5_50")
         assert Board.parsed("checkerboard:9x6:0.025") == Board(9, 6, 0.025)

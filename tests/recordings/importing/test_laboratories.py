@@ -202,7 +202,6 @@ BAD_WORDS = [
     (["--focal", "700", "--intrinsics", "CALIBRATION"], r"--intrinsics and --focal both say how the lenses are"),
     (["--distance", "02,05"], r"--distance says '02,05', expected CAMERA,CAMERA,METRES"),
     (["--distance", "02,02,1"], r"--distance says '02,02,1', expected"),
-    (["--board", "a4"], r"--board says 'a4', expected charuco"),
     (["--stills", "FOLDER"], r"--stills .* is no folder with images"),
 ]
 
