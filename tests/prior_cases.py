@@ -40,6 +40,12 @@ def camera_at(
     return Camera("camera", *size, K, T)
 
 
+def world_points(camera: Camera, depth: np.ndarray) -> np.ndarray:
+    """World point [H * W, 3] of every pixel centre at its planar depth [H, W]."""
+    in_camera = (viewing_rays(camera, np.float64) * depth[..., None]).reshape(-1, 3)
+    return (in_camera - camera.T_camera_world[:3, 3]) @ camera.T_camera_world[:3, :3]
+
+
 def plane_seen_by(camera: Camera, normal: Sequence[float], offset: float) -> np.ndarray:
     """Planar depth [H, W] of the plane normal . X = offset of the world, 0 where a ray does not meet it."""
     R, t = camera.T_camera_world[:3, :3], camera.T_camera_world[:3, 3]

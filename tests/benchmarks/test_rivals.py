@@ -9,25 +9,21 @@ import pytest
 import torch
 from at_once import measured_at_once
 from numpy.lib.stride_tricks import sliding_window_view
-from tiny import BACKBONES, TinyStore, make_adapter, make_model, make_views
+from tiny import TinyStore, make_adapter, make_model
 from torch import Tensor
 
-from benchmarks.rivals.patch_norm import PatchNorm, PatchNormConfig, hard_and_soft, patch_norm_loss
+from benchmarks.rivals.patch_norm import patch_norm_loss
 from benchmarks.rivals.pearson import pearson_depth_loss
 from benchmarks.rivals.scale_shift import scale_shift_loss
 from benchmarks.rivals.sparse_points import Seen, sparse_point_loss
 from benchmarks.rivals.sweep import best_change
-from benchmarks.rivals.table import RIVAL_PRESETS, RIVALS, guidance
+from benchmarks.rivals.table import RIVAL_PRESETS, RIVALS
 from d2_plugin import D2Config, D2Hooks
 from d2_plugin.errors import D2Error
-from d2_plugin.hooks import Context, Hook, HookConfig
-from d2_plugin.hooks.prior import PriorLoader
-from d2_plugin.protocol import View
+from d2_plugin.hooks import Hook, HookConfig
 from d2_plugin.runs.ablation.ablate import ablate
 from d2_plugin.runs.ablation.presets import PRESETS, rows_named
 from d2_plugin.runs.rows import read_rows
-from d2_plugin.runs.run import Run
-from d2_plugin.runs.saved import read_run
 from d2_plugin.runs.settings import RunSettings
 
 RNG = np.random.default_rng(7)
@@ -138,111 +134,28 @@ def test_where_nothing_can_be_told_there_is_no_gradient(name: str, dtype: torch.
     assert (d.grad == 0).all()
 
 
-class OneMap:
-    """What `Inputs` knows of depth: a slope."""
-
-    def inverse_depth(self, view: View) -> Tensor:
-        return torch.linspace(1, 2, view.width).expand(view.height, -1)
-
-
-@pytest.mark.parametrize("backbone", BACKBONES)
-@pytest.mark.parametrize(
-    ("soft_start", "wanted"), [(10, {"positions"}), (0, {"positions", "opacity_logits"})], ids=["hard", "and soft"]
-)
-def test_hard_depth_moves_centres_and_soft_depth_fades_gaussians_and_nothing_else_learns(
-    backbone: str, soft_start: int, wanted: set[str]
-) -> None:
-    """DNGaussian's code freezes all but positions for one term, and all but opacities for the other."""
-    adapter = make_adapter(make_model(backbone=backbone))
-    hook = PatchNorm(PatchNormConfig(soft_start=soft_start), OneMap())
-    context = Context(5, adapter, make_views()[:1], PriorLoader(TinyStore()), torch.Generator().manual_seed(0))
-    loss = hook.loss(context)
-    loss.backward()
-    trained = adapter.trained()
-    assert {name for name, value in trained.items() if value.grad is not None and value.grad.any()} == wanted
-
-
-@pytest.mark.parametrize("backbone", BACKBONES)
-def test_hard_depth_draws_what_ends_fainter(backbone: str) -> None:
-    """A Gaussian of another instant is no solid surface at this one."""
-    adapter, view = make_adapter(make_model(backbone=backbone)), make_views()[0]
-    splats = adapter.slice_at(view)
-    alive = splats.opacities / adapter.trained()["opacity_logits"][splats.rows].sigmoid()
-    hard, soft = hard_and_soft(adapter, view, 0.95)
-    assert alive.min() < 0.999
-    torch.testing.assert_close(hard.opacities, 0.95 * alive)
-    torch.testing.assert_close(soft.opacities, splats.opacities)
-    assert torch.equal(hard.means, splats.means)
-
-
-@pytest.fixture(scope="module")
-def room(saved_room: Callable[..., Path]) -> Path:
-    return saved_room(cameras=2, held_out=1, frames=2, width=96, height=54)
-
-
-@pytest.fixture(scope="module")
-def ablation(room: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def test_every_rival_trains_on_one_prior_and_says_its_name(saved_room: Callable[..., Path], tmp_path: Path) -> None:
     pytest.importorskip("pycolmap", reason="pycolmap is in the `stereo` extra")
-    pytest.importorskip("cv2", reason="opencv is in the `image` extra")
-    output = tmp_path_factory.mktemp("ablation") / "out"
-    base = RunSettings(str(room), ("train0", "train1"), iterations=24)
+    room = saved_room(cameras=2, held_out=1, frames=2, width=96, height=54)
     presets = rows_named(["backbone", *RIVALS, "full"], PRESETS | RIVAL_PRESETS)
     with measured_at_once():
-        ablate(base, presets, ["yang4d"], [0], output, 1, "")
-    return output
+        ablate(RunSettings(str(room), ("train0", "train1"), iterations=24), presets, ["yang4d"], [0], tmp_path, 1, "")
+    rows = read_rows([tmp_path / "runs.jsonl"])
+    assert {row["method"].removeprefix("yang4d ") for row in rows} == {"backbone", *RIVALS, "full"}
+    assert [path.name for path in (tmp_path / "priors").iterdir() if path.is_dir()] == ["dual"]
+    for name in RIVALS:
+        metrics = json.loads((tmp_path / "yang4d" / name / "seed0" / "metrics.json").read_text())
+        assert metrics["guidance"]["name"] == name
+        assert metrics["cpu_seconds"]["train"] > 0
 
 
-def folder_of(output: Path, method: str) -> Path:
-    return output / "yang4d" / method / "seed0"
+@pytest.mark.parametrize("name", RIVALS)
+def test_the_best_of_a_rival_is_that_of_the_sweep(name: str) -> None:
+    """No weight of a table is chosen by hand."""
+    rows = read_rows([Path(__file__).parents[2] / "docs" / "results" / "rivals-sweep.jsonl"])
+    assert str(RIVALS[name].best) == best_change(rows, name)
 
 
-def run_of(output: Path, name: str) -> Run:
-    stored = read_run(folder_of(output, name))
-    rival = guidance(stored.pop("guidance")["name"], 24)
-    return Run(RunSettings.from_table(stored, "run.json"), folder_of(output, name), rival)
-
-
-class TestOnARecording:
-    def test_every_rival_trains_on_one_prior_and_says_its_name(self, ablation: Path) -> None:
-        rows = [json.loads(line) for line in (ablation / "runs.jsonl").read_text().splitlines()]
-        assert {row["method"].removeprefix("yang4d ") for row in rows} == {"backbone", *RIVALS, "full"}
-        assert [path.name for path in (ablation / "priors").iterdir() if path.is_dir()] == ["dual"]
-        for name in RIVALS:
-            metrics = json.loads((folder_of(ablation, name) / "metrics.json").read_text())
-            assert metrics["guidance"]["name"] == name
-            assert metrics["cpu_seconds"]["train"] > 0
-
-    def test_a_dense_start_adds_stereo_points_to_the_triangulated_ones(self, ablation: Path) -> None:
-        run = run_of(ablation, "dense_start")
-        points = run.prepare()
-        started = guidance("dense_start", 24).start(run.scene, points, run.priors)
-        assert len(points) + 300 < len(started) <= len(points) + 0.18 * 96 * 54 + 6  # each of four images rounds
-        np.testing.assert_array_equal(started.positions[: len(points)], points.positions)
-        assert set(started.times) == {0.0, run.scene.recording.seconds(1)}
-
-
-class TestAtTheirBest:
-    @pytest.mark.parametrize("name", RIVALS)
-    def test_the_best_is_that_of_the_sweep(self, name: str) -> None:
-        """No weight of a table is chosen by hand."""
-        rows = read_rows([Path(__file__).parents[2] / "docs" / "results" / "rivals-sweep.jsonl"])
-        assert str(RIVALS[name].best) == best_change(rows, name)
-
-
-class TestHooksAsObjects:
-    """`D2Hooks(..., hooks={...})`: what rivals plug in by, and anybody's own hook."""
-
-    class Constant(Hook):
-        def loss(self, context: Context) -> Tensor:
-            return torch.tensor(0.25)
-
-    def test_a_hook_of_ones_own_runs_in_its_window_beside_none_of_d2s(self) -> None:
-        hook = self.Constant(HookConfig(start=2))
-        d2 = D2Hooks(D2Config(retire_after=1), make_adapter(make_model()), TinyStore(), {"constant": hook})
-        assert [float(d2.loss(step, make_views()[:1])) for step in (1, 2)] == [0.0, 0.25]
-        assert d2.step(2).inserted == 0
-        assert set(d2.state_dict()["hooks"]) == {"constant"}
-
-    def test_the_name_of_one_of_d2s_is_refused(self) -> None:
-        with pytest.raises(D2Error, match="named 'prune'"):
-            D2Hooks(D2Config(), make_adapter(make_model()), TinyStore(), {"prune": self.Constant(HookConfig())})
+def test_a_hook_of_ones_own_does_not_take_the_name_of_one_of_d2s() -> None:
+    with pytest.raises(D2Error, match="named 'prune'"):
+        D2Hooks(D2Config(), make_adapter(make_model()), TinyStore(), {"prune": Hook(HookConfig())})

@@ -13,10 +13,10 @@ from typing import Annotated, Optional
 
 import pytest
 from mimics.workplace import furnish
+from refusals import refuses
 
 from d2_plugin import older, registry
 from d2_plugin.config import D2Config
-from d2_plugin.errors import D2Error
 from d2_plugin.hooks import HOOKS
 from d2_plugin.settings import Range, Settings, declared
 
@@ -28,8 +28,6 @@ OUTSIDE = ("d2_plugin.priors", "d2_plugin.recordings", "d2_plugin.runs", "d2_plu
 
 NOT_NEEDED = ("cv2", "pycolmap", "onnxruntime", "rich", "matplotlib")
 """Packages that training does without; a bare import needs neither these nor torch and numpy."""
-
-BARE = "import sys, d2_plugin; print(*sys.modules)"
 
 ATTACHED = f"""
 import sys
@@ -99,7 +97,7 @@ def trainer(tmp_path_factory: pytest.TempPathFactory) -> list[list[str]]:
 
 
 def test_importing_the_plugin_imports_nothing_else() -> None:
-    [names] = printed(BARE)
+    [names] = printed("import sys, d2_plugin; print(*sys.modules)")
     assert [name for name in names if name.startswith("d2_plugin")] == ["d2_plugin"]
     assert not {"torch", "numpy", *NOT_NEEDED} & set(names)
 
@@ -150,13 +148,12 @@ class TestAnnotations:
         class Old(Settings):
             share: Optional[Annotated[float, Range(0, 1)]] = None  # noqa: UP045  as the stand-in evaluates it
 
-        with pytest.raises(D2Error, match=r"Old.share"):
-            Old(share=2.0)
+        refuses(r"Old.share", Old, share=2.0)
         assert declared(Old)[0].default is None
 
     def test_a_missing_stand_in_is_named_with_its_command(self) -> None:
-        with pytest.raises(D2Error, match=r"cannot read TOML by itself: run `pip install tomli`"):
-            older.stand_in("no_such_module", "tomli", "read TOML")
+        says = r"cannot read TOML by itself: run `pip install tomli`"
+        refuses(says, older.stand_in, "no_such_module", "tomli", "read TOML")
 
 
 def test_entry_points_are_found_in_the_shape_of_python_3_9(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,4 +1,4 @@
-"""Poses from what cameras saw of the same things: refined, found, scaled, and refused where that settles nothing."""
+"""Poses and lenses from what cameras saw of the same things: refined, found, scaled, refused where nothing settles."""
 
 import zlib  # noqa: F401  (pycolmap brings a zlib of its own that must not come first)
 from collections.abc import Callable
@@ -8,16 +8,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 from refusals import refuses
-from rigs import NOISE, arc, moved, seen_by, worst
+from rigs import NOISE, arc, filmed, held, moved, seen_by, worst
 
+from d2_plugin.errors import D2Error
 from d2_plugin.recordings import open_recording, select_cameras
-from d2_plugin.recordings.cameras.calibrating.bundle import project
-from d2_plugin.recordings.cameras.calibrating.features import find_features
+from d2_plugin.recordings.cameras.calibrating import Board, scaled_by_board
+from d2_plugin.recordings.cameras.calibrating.bundle import Tracks
+from d2_plugin.recordings.cameras.calibrating.features import find_features, of_a_still_camera
 from d2_plugin.recordings.cameras.calibrating.refine import Turn, refine_poses, turns_in_words
-from d2_plugin.recordings.cameras.calibrating.rig import aligned
+from d2_plugin.recordings.cameras.calibrating.sharpen import sharpened
 from d2_plugin.recordings.cameras.calibrating.solve import solve_features, solve_rig
-from d2_plugin.recordings.cameras.camera import rig_width, rigid
-from d2_plugin.recordings.cameras.epipolar import degrees_between, sampson
+from d2_plugin.recordings.cameras.camera import pinhole, rig_width
+from d2_plugin.recordings.cameras.epipolar import degrees_between
+from d2_plugin.recordings.recording import Camera
 from d2_plugin.recordings.selection import spread
 
 pytest.importorskip("pycolmap", reason="pycolmap is in the `calibration` extra")
@@ -128,32 +131,140 @@ def test_a_real_rig_with_neighbours_up_to_42_degrees_apart_is_settled(shared_dat
     assert worst(rig.cameras, dome.cameras)[0] < 0.2
 
 
-def test_features_lie_where_things_are_not_a_quarter_of_a_pixel_beside() -> None:
-    y, x = np.mgrid[:120, :120] + 0.5
-    centres = np.array([[30.3, 40.7], [80.25, 70.5], [90.8, 25.1], [40.4, 90.9]])
-    grey = sum(200 * np.exp(-((x - cx) ** 2 + (y - cy) ** 2) / 40) for cx, cy in centres)
-    image = np.repeat(np.clip(grey, 0, 255).astype(np.uint8)[..., None], 3, axis=2)
-    found = find_features([image]).pixels
-    for centre in centres:
-        nearest = found[np.linalg.norm(found - centre, axis=1).argmin()]
-        np.testing.assert_allclose(nearest, centre, atol=0.1)
+def blind(cameras: dict[str, Camera]) -> dict[str, Camera]:
+    """The cameras with a focal length that is far off."""
+    return {
+        name: replace(camera, K=pinhole(300, 300, camera.width / 2, camera.height / 2))
+        for name, camera in cameras.items()
+    }
 
 
-def test_sampsons_distance_is_zero_for_what_both_see_and_grows_by_the_pixel() -> None:
-    cameras = arc(2)
-    points = np.random.default_rng(0).uniform(-1, 1, (50, 3))
-    p, q = (project(camera, points) for camera in cameras.values())
-    assert np.abs(sampson(cameras["c0"], cameras["c1"], p, q)).max() < 1e-9
-    off = sampson(cameras["c0"], cameras["c1"], p, q + [0, 2.0])  # across the lines, shared by the two
-    assert 0.9 < np.median(off) < 1.6
+class TestFocalLengths:
+    """Not known beforehand."""
+
+    @pytest.mark.parametrize("focal", ["shared", pytest.param("each", marks=pytest.mark.slow)])
+    def test_are_found_with_the_poses(self, focal: str) -> None:
+        truth = {
+            name: replace(camera, K=pinhole(600, 600, camera.width / 2, camera.height / 2))
+            for name, camera in arc().items()
+        }
+        rig = solve_features(seen_by(truth, things=120), blind(truth), tuple(truth), focal=focal)
+        for name, camera in rig.cameras.items():
+            assert camera.K[0, 0] == pytest.approx(600, rel=0.01)
+            assert abs(np.log(camera.K[0, 0] / 600)) < max(2 * rig.focals[name], 0.004)
+        assert len({camera.K[0, 0] for camera in rig.cameras.values()}) == (1 if focal == "shared" else len(truth))
+        assert worst(rig.cameras, truth)[0] < 0.3
+        assert "focal length 60" in rig.verdicts()["c0"] or "focal length 59" in rig.verdicts()["c0"]
+
+    def test_are_found_where_matches_agree_with_any(self) -> None:
+        """Two views of things without false matches look right with many focal lengths: the third one tells."""
+        truth = arc(3)
+        rig = solve_features(seen_by(truth, things=250), truth, tuple(truth), focal="shared")
+        assert {round(float(camera.K[0, 0]) / 600, 2) for camera in rig.cameras.values()} == {1.0}
+        assert worst(rig.cameras, truth)[0] < 0.1
+
+    def test_that_the_images_do_not_tell_are_refused(self) -> None:
+        truth = arc(3, 4.0)  # hardly any angle: focal length and depth change places
+        with pytest.raises(D2Error, match=r"two halves of the images disagree about|do not settle"):
+            solve_features(seen_by(truth, things=60), blind(truth), tuple(truth), focal="each")
+        with pytest.raises(D2Error, match="c0 shares nothing with the others"):
+            solve_features(seen_by(truth, things=6, wrong=1.0), blind(truth), tuple(truth), focal="shared")
 
 
-def test_a_rig_is_laid_over_another_by_its_rotations() -> None:
-    cameras = arc(2)  # two centres alone leave a turn about their line open
-    R = cv2.Rodrigues(np.array([0.3, -0.8, 0.5]))[0]
-    turned = {}
-    for name, camera in cameras.items():
-        T = camera.T_camera_world
-        turned[name] = replace(camera, T_camera_world=rigid(T[:3, :3] @ R, 3 * T[:3, 3] + T[:3, :3] @ [1.0, 2, 3]))
-    for name, camera in aligned(turned, cameras).items():
-        np.testing.assert_allclose(camera.T_camera_world, cameras[name].T_camera_world, atol=1e-9)
+class TestBoards:
+    """Corners are matches, however little else two cameras share."""
+
+    def test_an_inverted_board_and_one_of_older_programs_are_seen(self) -> None:
+        images, board = filmed(arc(2), 0.25)
+        assert len(board.corners(255 - images["c0"][0])) == len(board.corners(images["c0"][0])) == 24
+        dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+        older = cv2.aruco.CharucoBoard((7, 6), 0.25, 0.1875, dictionary)
+        older.setLegacyPattern(True)
+        drawn = cv2.copyMakeBorder(older.generateImage((420, 360)), *[60] * 4, cv2.BORDER_CONSTANT, value=128)
+        assert len(replace(board, rows=6).corners(np.repeat(drawn[..., None], 3, 2))) == 30
+
+    @pytest.mark.parametrize("size", [(8, 6), (8, 5)])
+    def test_a_plain_board_that_some_see_the_other_way_up_settles_the_rig_and_its_scale(self, size) -> None:
+        truth = arc(3, 40.0, 0.5)
+        images, board = held(truth, 0.2, 5, plain=size)
+        images["c1"] = [np.ascontiguousarray(image[::-1, ::-1]) for image in images["c1"]]  # hung upside down
+        K = truth["c1"].K * [[1, 1, -1], [1, 1, -1], [1, 1, 1]] + [[0, 0, 320], [0, 0, 240], [0, 0, 0]]
+        over = np.diag([-1.0, -1, 1, 1])
+        truth["c1"] = replace(truth["c1"], K=K, T_camera_world=over @ truth["c1"].T_camera_world)
+        rig = solve_rig(images, truth, board=board)
+        degrees, share = worst(rig.cameras, truth)
+        assert degrees < 0.1
+        assert share < 0.003
+        scaled = scaled_by_board(rig, images, board)
+        assert rig_width(scaled.cameras.values()) == pytest.approx(rig_width(truth.values()), rel=0.005)
+        assert "the board was seen by c0 in 5 of 5 images, c1 in" in scaled.scale
+
+    def test_half_of_a_charuco_board_is_enough_for_the_scale_and_half_of_a_plain_one_is_not(self) -> None:
+        truth = arc(3)
+        images, board = filmed(truth, 0.25)
+        half = {name: [taken[0].copy()] for name, taken in images.items()}
+        for taken in half.values():
+            taken[0][:, 320:] = 128
+        rig = solve_features(seen_by(truth), truth, tuple(truth))
+        scaled = scaled_by_board(rig, half, board)
+        assert rig_width(scaled.cameras.values()) == pytest.approx(rig_width(truth.values()), rel=0.01)
+        assert "sides of a board's squares" in scaled.scale
+        blank = [np.full((480, 640, 3), 128, np.uint8)]
+        one = {"c0": half["c0"], "c1": blank, "c2": blank}
+        refuses(r"saw 0 sides .*c1 in 0 of 1 images.*: show the whole board", scaled_by_board, rig, one, board)
+        refuses("unknown marker dictionary 'DICT_9'", scaled_by_board, rig, half, replace(board, dictionary="DICT_9"))
+        refuses("saw 0 sides of the board's squares .* show", scaled_by_board, rig, half, replace(board, marker=None))
+
+    def test_words_are_a_board_or_refused(self) -> None:
+        for text in ("", "a4", "charuco:7x5:0.04", "charuco:7x5:0.03:0.04", "checkerboard:9x6:-1", "chess:9x6:0.1"):
+            refuses("expected charuco:COLUMNSxROWS:SQUARE:MARKER", Board.parsed, text)
+        assert Board.parsed("charuco:7x5:0.04:0.03:DICT_5X5_50") == Board(7, 5, 0.04, 0.03, "DICT_5X5_50")
+        assert Board.parsed("checkerboard:9x6:0.025") == Board(9, 6, 0.025)
+
+
+class TestPlaces:
+    """Of features."""
+
+    def test_features_lie_where_things_are_not_a_quarter_of_a_pixel_beside(self) -> None:
+        y, x = np.mgrid[:120, :120] + 0.5
+        centres = np.array([[30.3, 40.7], [80.25, 70.5], [90.8, 25.1], [40.4, 90.9]])
+        grey = sum(200 * np.exp(-((x - cx) ** 2 + (y - cy) ** 2) / 40) for cx, cy in centres)
+        image = np.repeat(np.clip(grey, 0, 255).astype(np.uint8)[..., None], 3, axis=2)
+        found = find_features([image]).pixels
+        for centre in centres:
+            nearest = found[np.linalg.norm(found - centre, axis=1).argmin()]
+            np.testing.assert_allclose(nearest, centre, atol=0.1)
+
+    def test_features_are_moved_to_where_their_surroundings_are(self) -> None:
+        rng = np.random.default_rng(0)
+        noise = cv2.GaussianBlur(rng.uniform(0, 255, (240, 320)).astype(np.float32), (0, 0), 2.5)
+        grey = np.clip((noise - noise.mean()) * 8 + 128, 0, 255).astype(np.uint8)
+        warp = np.array([[1.05, 0.08, -9.3], [-0.05, 0.96, 6.7]])  # what a slanted surface does to an image
+        other = np.clip(0.8 * cv2.warpAffine(grey, warp, (320, 240), flags=cv2.INTER_CUBIC) + 10, 0, 255)
+        one, two = (find_features([np.repeat(p.astype(np.uint8)[..., None], 3, 2)]) for p in (grey, other))
+        inside = np.all((one.pixels > 40) & (one.pixels < (280, 200)), axis=1)
+        expected = (one.pixels - 0.5) @ warp[:, :2].T + warp[:, 2] + 0.5
+        rows = np.flatnonzero(inside)[:150]
+        two = replace(two, pixels=expected[rows] + rng.normal(0, 0.4, (len(rows), 2)), shapes=one.shapes[rows])
+        two = replace(two, moments=np.zeros(len(rows), int))
+        tracks = Tracks(("a", "b"), np.stack([rows, np.arange(len(rows))], axis=1))
+        camera = Camera("a", 320, 240, pinhole(300, 300, 160, 120), np.eye(4))
+        better, kept = sharpened({"a": one, "b": two}, tracks, {"a": camera, "b": camera})
+        assert len(kept.seen) > 0.9 * len(rows)
+        off = better["b"].pixels[kept.seen[:, 1]] - expected[kept.seen[:, 0]]
+        assert np.median(np.linalg.norm(off, axis=1)) < 0.06  # of half a pixel; OpenCV warps by 32nds of a pixel
+        assert np.array_equal(better["a"].pixels, one.pixels)
+
+    def test_what_stands_still_is_one_witness(self) -> None:
+        rng = np.random.default_rng(0)
+        noise = cv2.GaussianBlur(rng.uniform(0, 255, (120, 160)).astype(np.float32), (0, 0), 2)
+        wall = np.repeat(noise[..., None], 3, 2)
+        taken = []
+        for moment in range(5):
+            image = wall.copy()
+            image[40:60, 20 * moment : 20 * moment + 20] = rng.uniform(0, 255, (20, 20, 1))
+            taken.append(np.clip((image - 128) * 3 + 128, 0, 255).astype(np.uint8))
+        found = of_a_still_camera(taken)
+        assert np.mean(found.moments == 0) > 0.5
+        moving = found.pixels[found.moments > 0]
+        assert np.all((moving[:, 1] > 30) & (moving[:, 1] < 70))

@@ -4,14 +4,15 @@ from collections.abc import Callable
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from prior_cases import showing, world_points
+from recorded import graded
 from refusals import refuses
 
 from d2_plugin.errors import D2Error
-from d2_plugin.recordings import Recording, Source, open_recording, select_cameras
+from d2_plugin.recordings import Recording, open_recording, select_cameras
 from d2_plugin.recordings.cameras import check
 from d2_plugin.recordings.cameras.camera import checked_camera
 from d2_plugin.recordings.cameras.check import check_recording
@@ -96,12 +97,8 @@ def test_a_rig_far_from_the_origin_is_named(room: Recording) -> None:
 
 
 def test_images_of_one_colour_are_named(room: Recording) -> None:
-    class Dark(Source):
-        def image(self, camera: str, frame: int) -> np.ndarray:
-            return np.full((H, W, 3), 200 * frame, np.uint8)
-
     name = next(iter(room.cameras))
-    notes = notes_of(replace(room, source=Dark()))
+    notes = notes_of(showing(room, {"image": lambda camera, frame: np.full((H, W, 3), 200 * frame, np.uint8)}))
     assert f"camera {name} is black at frame 0: nothing can be learned from that" in notes
     assert f"camera {name} is of one colour at frame 1: nothing can be learned from that" in notes
 
@@ -140,23 +137,18 @@ CAMERAS = ("train0", "train1", "train2")
 def wide_room() -> tuple[Recording, np.ndarray, np.ndarray]:
     """A recording and surface points seen in its first image, some of them hidden from the others."""
     recording = synthetic_recording(cameras=4, frames=2, width=160, height=90)
-    camera, depth = recording.cameras["train1"], recording.depth("train1", 0)
-    rows, columns = np.mgrid[3:87:4, 3:157:4].reshape(2, -1)
-    rays = np.stack([columns + 0.5, rows + 0.5, np.ones(len(rows))], -1) @ np.linalg.inv(camera.K).T
-    points = rays * depth[rows, columns, None]
-    world = (points - camera.T_camera_world[:3, 3]) @ camera.T_camera_world[:3, :3]
-    return recording, world, np.zeros(len(world))
+    world = world_points(recording.cameras["train1"], recording.depth("train1", 0)).reshape(90, 160, 3)
+    points = world[3:87:4, 3:157:4].reshape(-1, 3)
+    return recording, points, np.zeros(len(points))
 
 
-def exposed(recording: Recording, gains: dict[str, tuple[float, float, float]]) -> SimpleNamespace:
+def exposed(recording: Recording, gains: dict[str, tuple[float, float, float]]) -> Recording:
     """The recording with a gain per camera and channel."""
 
     def image(camera: str, frame: int) -> np.ndarray:
-        bright = recording.image(camera, frame) * np.array(gains.get(camera, (1, 1, 1)))
-        return np.clip(np.rint(bright), 0, 255).astype(np.uint8)
+        return graded(recording.image(camera, frame), gains.get(camera, (1, 1, 1)))
 
-    kept = {name: getattr(recording, name) for name in ("cameras", "frames", "seconds", "exposures")}
-    return SimpleNamespace(**kept, image=image)
+    return showing(recording, {"image": image})
 
 
 def test_cameras_of_equal_exposure_agree(wide_room: tuple) -> None:

@@ -76,24 +76,6 @@ def test_an_undistorted_image_is_what_the_pinhole_sees(name: str) -> None:
     assert error.max() < 5
 
 
-@pytest.mark.parametrize(
-    ("model", "distortion"),
-    [
-        ("fisheye", (0.05, -0.02, 0.004, -0.001)),
-        ("opencv", (-0.2, 0.05, 0.003, -0.002, 0.01)),
-        ("opencv", (0.4, -0.1, 1e-3, 2e-3, 0.02, 0.5, 0.03, 0.01)),
-    ],
-)
-def test_models_are_opencvs(model: str, distortion: tuple[float, ...]) -> None:
-    cv2 = pytest.importorskip("cv2")
-    rays = np.random.default_rng(0).uniform(-0.6, 0.6, (50, 2))
-    points, none = np.column_stack([rays, np.ones(50)])[:, None], np.zeros(3)
-    project = cv2.fisheye.projectPoints if model == "fisheye" else cv2.projectPoints
-    expected, _ = project(points, none, none, K, np.array(distortion))
-    lens = checked_lens(K, model, distortion, "here")
-    np.testing.assert_allclose(lens.recorded_pixels(rays * K[[0, 1], [0, 1]] + K[:2, 2]), expected[:, 0], atol=1e-9)
-
-
 @settings(max_examples=40, deadline=None)
 @given(st.floats(-0.8, -0.05), st.floats(0.0, 0.2))
 def test_rays_beyond_the_fold_of_the_polynomial_have_no_image(k1: float, k2: float) -> None:

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from refusals import refuses
 from small_layouts import small_recording
 
-from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.photometric import photometric_loss, weighted_photometric_loss
 from d2_plugin.priors.construct import _within
 from d2_plugin.priors.fuse import fuse
@@ -75,8 +75,7 @@ def test_a_mask_may_have_any_number_of_channels(channels: int, tmp_path: Path) -
 def test_a_mask_of_another_size_is_refused(tmp_path: Path) -> None:
     path = recorded_folder(tmp_path / "recording")
     write_mask(path / "masks" / "cam00" / "0000.png", np.zeros((H, W + 1), np.uint8))
-    with pytest.raises(D2Error, match="mask of frame 0 of camera cam00 is 49x32 pixels"):
-        open_recording(path).mask("cam00", 0)
+    refuses("mask of frame 0 of camera cam00 is 49x32 pixels", open_recording(path).mask, "cam00", 0)
 
 
 def test_masks_are_downscaled_and_saved_with_the_images(tmp_path: Path) -> None:

@@ -6,11 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from small_layouts import write_layout
-from stand_in_recordings import refused
+from stand_in_recordings import refused, write_grey
 
 from d2_plugin.recordings import open_recording
 from d2_plugin.recordings.cameras.formats.colmap import MODELS, ColmapCamera, find_model, read_model, read_points
-from d2_plugin.recordings.images import write_png
 
 W, H = 32, 24
 PINHOLE = "1 PINHOLE 32 24 30 31 15.5 12.25"
@@ -21,11 +20,6 @@ def write_text(folder: Path, cameras: list[str], images: list[str], observations
     folder.mkdir(parents=True)
     (folder / "cameras.txt").write_text("# Camera list\n" + "\n".join(cameras) + "\n")
     (folder / "images.txt").write_text("# Image list\n" + "".join(f"{image}\n{observations}\n" for image in images))
-
-
-def write_grey(path: Path, value: int = 0, size: tuple[int, int] = (W, H)) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_png(path, np.full((size[1], size[0], 3), value, np.uint8))
 
 
 def pose_line(identity: int, name: str, camera: int = 1, x: float = 0.0) -> str:

@@ -49,17 +49,11 @@ def test_cameras_are_those_with_intrinsics_pose_and_images(tmp_path: Path) -> No
     refused(path, r"camera 02 has images but is not in .*extri\.yml, which has 00, 11", cameras=["02"])
 
 
-def test_a_real_camera_is_placed_as_opencv_says(tmp_path: Path) -> None:
+def test_near_and_far_stand_beside_the_pose_where_a_camera_has_them(tmp_path: Path) -> None:
     path = scene(tmp_path)
     with (path / "extri.yml").open("a") as file:
         file.write("n_11: 3.5\nf_11: 9\n")
     cameras = open_recording(path).cameras
-    rotation = cv2.Rodrigues(np.array(R_11))[0]
-    np.testing.assert_allclose(rotation_of_vector(np.array(R_11)), rotation, atol=1e-12)
-    np.testing.assert_allclose(cameras["11"].T_camera_world[:3, :3], rotation, atol=2e-6)
-    np.testing.assert_allclose(cameras["11"].centre, -rotation.T @ np.array(T_11), atol=1e-5)
-    # OpenCV, with which EasyMocap calibrates, has the centre of the first pixel at 0: here it is at 0.5.
-    np.testing.assert_allclose(cameras["11"].K, [[40.1, 0, 25.56], [0, 40.3, 13.8], [0, 0, 1]])
     assert (cameras["11"].near_far, cameras["00"].near_far) == ((3.5, 9.0), None)
 
 

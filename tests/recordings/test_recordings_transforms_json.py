@@ -12,7 +12,6 @@ from d2_plugin.recordings import open_recording
 from d2_plugin.recordings.images import read_image
 
 W, H = 32, 24
-Frames = list[dict]
 
 
 def entry(name: str, x: float = 0.0, **more: object) -> dict:
@@ -22,14 +21,14 @@ def entry(name: str, x: float = 0.0, **more: object) -> dict:
     return {"file_path": name, "transform_matrix": matrix.tolist()} | more
 
 
-def write(path: Path, frames: Frames, file: str = "transforms.json", **top: object) -> Path:
+def write(path: Path, frames: list[dict], file: str = "transforms.json", **top: object) -> Path:
     for i, frame in enumerate(frames):
         write_grey(path / f"{frame['file_path']}.png", i)
     (path / file).write_text(json.dumps({"camera_angle_x": 1.0, **top, "frames": frames}))
     return path
 
 
-def two_by_two(**more: object) -> Frames:
+def two_by_two(**more: object) -> list[dict]:
     return [entry(f"images/cam{c:02d}_{f:04d}", x=c, time=f / 30, **more) for c in (0, 7) for f in (0, 1)]
 
 

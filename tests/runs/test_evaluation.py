@@ -30,13 +30,14 @@ def recording() -> Recording:
     return select_cameras(synthetic_recording(cameras=3, frames=2, width=72, height=40), NAMES)
 
 
-def renderer(recording: Recording, offset: float = 0.0, depth_factor: float = 1.0, hole: int = 0) -> RenderView:
-    """Renders the truth plus an offset per colour; depth is scaled, and missing in the first `hole` columns."""
+def renderer(recording: Recording, offset: float = 0.0, missing: float | None = None) -> RenderView:
+    """Renders the truth plus an offset per colour; what is `missing` stands in the first quarter of the depth."""
 
     def render(camera: str, frame: int) -> tuple[Tensor, Tensor]:
         color = torch.from_numpy(recording.image(camera, frame).astype(np.float32) / 255) + offset
-        depth = depth_factor * torch.from_numpy(recording.depth(camera, frame))
-        depth[:, :hole] = 0
+        depth = torch.from_numpy(recording.depth(camera, frame)).clone()
+        if missing is not None:
+            depth[:, :18] = missing
         return color, depth
 
     return render
@@ -122,8 +123,9 @@ def test_both_lpips_networks_are_kept_apart(recording: Recording) -> None:
         assert (result["test"][name], result["variants"][name]) == net
 
 
-def test_a_hole_in_the_rendered_depth_counts_as_wrong(recording: Recording) -> None:
-    [row] = evaluate(renderer(recording, hole=18), recording, ["test0"], [0])["per_view"]
+@pytest.mark.parametrize("missing", [0.0, np.nan, np.inf, -1.0])
+def test_a_hole_in_the_rendered_depth_counts_as_wrong(recording: Recording, missing: float) -> None:
+    [row] = evaluate(renderer(recording, missing=missing), recording, ["test0"], [0])["per_view"]
     assert row["depth_absrel"] == pytest.approx(18 / 72)
     assert row["depth_delta1"] == pytest.approx(1 - 18 / 72)
 

@@ -6,11 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from prior_cases import showing
+from prior_cases import showing, world_points
 from refusals import refuses
 
 from d2_plugin.errors import D2Error
-from d2_plugin.priors.geometry import viewing_rays
 from d2_plugin.priors.settings import PriorSettings, StereoSettings
 from d2_plugin.priors.stereo import matched_depth
 from d2_plugin.protocol import Label
@@ -102,8 +101,8 @@ def test_stereo_left_out_by_the_user_leaves_out_what_follows_from_it(moving) -> 
 
 
 def test_what_cannot_be_is_not_overridden(moving) -> None:
-    with pytest.raises(D2Error, match=r"\[plan\] stereo = true, but one training camera: it takes a second"):
-        plan_scene(moving, ["train0"], None).override(stereo=True)
+    alone = plan_scene(moving, ["train0"], None)
+    refuses(r"\[plan\] stereo = true, but one training camera: it takes a second", alone.override, stereo=True)
     twice = replace(moving, cameras=dict.fromkeys(("train0", "train1"), moving.cameras["train0"]))
     with pytest.raises(D2Error, match="all training cameras stand at one point: it takes cameras that stand apart"):
         plan_scene(twice, PAIR, None).override(stereo=True)
@@ -136,25 +135,6 @@ def test_angles_that_cannot_be_matched_are_no_overlap() -> None:
     assert max(measure_overlap(still, StereoSettings()).shares) == 0
 
 
-def test_points_tell_the_depths_where_no_range_is_declared() -> None:
-    pair = [camera("a"), camera("b", 0.5)]
-    points = np.random.default_rng(0).uniform((-0.5, -0.5, 1.99), (1, 0.5, 2.01), (200, 3))
-    found = measure_overlap(pair, StereoSettings(), points=points)
-    assert found.depth_known
-    assert found.shares == pytest.approx((0.75, 0.75))
-    assert not measure_overlap(pair, StereoSettings(), points=points[:5]).depth_known
-
-
-def test_unknown_depths_give_the_most_that_could_be_seen() -> None:
-    found = measure_overlap([camera("a", 0, 10), camera("b", 0.5, -10)], StereoSettings())
-    assert not found.depth_known
-    assert min(found.shares) > 0.9  # from some depth on, each pixel lies in the other image
-    assert found.angles == pytest.approx((20, 20))
-    apart = measure_overlap([camera("a", 0, -90), camera("b", 0.5, 90)], StereoSettings())
-    assert apart.shares == (0, 0)
-    assert apart.angles == ()
-
-
 def rig(recording: Recording, *cameras: Camera) -> Recording:
     """The recording with other cameras for train0 and train1; its images stay."""
     sized = [replace(c, width=96, height=54, K=pinhole(96, 96, 48, 27)) for c in cameras]
@@ -182,13 +162,13 @@ def test_images_without_texture_have_no_stereo_and_the_reason_says_so(moving) ->
 def test_a_colmap_model_brings_the_points_that_tell_the_depths(moving, tmp_path: Path) -> None:
     undeclared = {name: replace(c, near_far=None) for name, c in moving.cameras.items()}
     still = replace(select_frames(moving, [0]), cameras=undeclared)
-    depth, first = still.depth("train0", 0), still.cameras["train0"]
-    in_camera = (viewing_rays(first, np.float64) * depth[..., None]).reshape(-1, 3)[::37]
-    points = (in_camera - first.T_camera_world[:3, 3]) @ first.T_camera_world[:3, :3]
+    points = world_points(still.cameras["train0"], still.depth("train0", 0))[::37]
     cloud = PointCloud(points, np.full(points.shape, 0.5))
     model = open_recording(export_recording(still, "colmap", tmp_path / "model", cloud=cloud))
     assert "depths unknown" not in plan_scene(model, PAIR, None).as_dict()["stereo"]["reason"]
-    assert "depths unknown" in plan_scene(still, PAIR, None).as_dict()["stereo"]["reason"]
+    unknown = plan_scene(still, PAIR, None)
+    assert unknown.uses("stereo")
+    assert "depths unknown" in unknown.as_dict()["stereo"]["reason"]
 
 
 def with_sensor(recording: Recording, folder: Path, *cameras: str) -> Recording:

@@ -68,12 +68,6 @@ def scored(method: str, seed: int, target: str = "10 s", **scores: float) -> Row
     return make_row("quality", "room, 4 views", method, f"seed {seed}", error=0.1, seconds=1.0, **about)
 
 
-def lines_with(text: str, start: str) -> list[list[str]]:
-    """The cells of the table lines that begin so."""
-    found = [line.strip("|").split("|") for line in text.splitlines() if line.startswith(start)]
-    return [[cell.strip(" *") for cell in line] for line in found]
-
-
 def test_every_kind_becomes_a_section_with_device_commit_and_command(report: Path) -> None:
     page, text = (report / "report.html").read_text(), (report / "report.md").read_text()
     sections = text.split("\n## ")[1:]
@@ -126,8 +120,9 @@ class TestGroups:
         rows += [scored("yang4d mvs_only", seed, **best) for seed in range(2)]
         rows += [scored("yang4d backbone", seed, psnr=20.0, ssim1=0.5, lpips=0.5) for seed in range(3)]
         assert scores_table(groups_of(rows)).best == {(0, 4), (1, 5), (1, 6)}
-        text = make_report(rows, tmp_path)[1].read_text()
-        verdicts = {line[1]: line[2:] for line in lines_with(text, "| room, 4 views, 10 s ")}
+        lines = make_report(rows, tmp_path)[1].read_text().splitlines()
+        cells = [line.strip("|").split("|") for line in lines if line.startswith("| room, 4 views, 10 s ")]
+        verdicts = {line[1].strip(): [cell.strip(" *") for cell in line[2:]] for line in cells}
         assert [cell.split(" (")[0] for cell in verdicts["backbone alone"]] == ["holds"] * 3
         assert [cell.split(" (")[0] for cell in verdicts["stereo alone"]] == ["two seeds: no verdict"] * 3
 
@@ -220,10 +215,8 @@ def test_any_range_of_values_has_an_axis_with_its_ticks_inside(values: list[floa
     assert all(axis.low <= value <= axis.high for value, _ in axis.ticks())
 
 
-TABLE = Table(("name", "dB"), (("a|b", "28.9 ± 0.5"), ("c", "3")), frozenset({(0, 1)}))
-
-
 def test_markdown_keeps_bars_inside_their_cell_and_stresses_the_best() -> None:
-    assert markdown(TABLE).splitlines() == ["| name | dB |", "| --- | --- |", r"| a\|b | **28.9 ± 0.5** |", "| c | 3 |"]
+    table = Table(("name", "dB"), (("a|b", "28.9 ± 0.5"), ("c", "3")), frozenset({(0, 1)}))
+    assert markdown(table).splitlines() == ["| name | dB |", "| --- | --- |", r"| a\|b | **28.9 ± 0.5** |", "| c | 3 |"]
     best = Table(("a",), (("1|2",),), frozenset({(0, 0)}))
     assert markdown(best).splitlines()[-1] == r"| **1\|2** |"

@@ -149,15 +149,14 @@ class TestARunThatDiverges:
             Run.load(copied).evaluate(images=False)
 
 
-class TestOneWriter:
-    def test_a_second_trainer_is_refused(self, scene: Path, tmp_path: Path) -> None:
-        run = bare(scene, tmp_path / "run")
-        with only_writer(run.folder):
-            for second in (bare(scene, tmp_path / "run"), Run.load(run.folder)):
-                refuses("another process is writing .*: wait until it has ended", second.train)
-                refuses("another process is writing", second.evaluate)
-        run.train()
-        run.train()
+def test_a_second_trainer_is_refused(scene: Path, tmp_path: Path) -> None:
+    run = bare(scene, tmp_path / "run")
+    with only_writer(run.folder):
+        for second in (bare(scene, tmp_path / "run"), Run.load(run.folder)):
+            refuses("another process is writing .*: wait until it has ended", second.train)
+            refuses("another process is writing", second.evaluate)
+    run.train()
+    run.train()
 
 
 class TestThePriorOfARun:

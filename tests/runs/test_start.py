@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from prior_cases import world_points
 
-from d2_plugin.priors.geometry import projected, viewing_rays
+from d2_plugin.priors.geometry import projected
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.runs.start import TimedPoints, TrainingFrames, initial_points, scene_extent
 
@@ -19,10 +20,8 @@ def recording():
 
 
 def surface_points(recording, count: int) -> np.ndarray:
-    depth, camera = recording.depth("train0", 0), recording.cameras["train0"]
-    in_camera = (viewing_rays(camera, np.float64) * depth[..., None]).reshape(-1, 3)
-    in_camera = in_camera[np.linspace(0, depth.size - 1, count).astype(int)]
-    return (in_camera - camera.T_camera_world[:3, 3]) @ camera.T_camera_world[:3, :3]
+    points = world_points(recording.cameras["train0"], recording.depth("train0", 0))
+    return points[np.linspace(0, len(points) - 1, count).astype(int)]
 
 
 def test_kept_images_do_not_grow_with_the_number_of_frames(recording, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -16,7 +16,6 @@ viser = pytest.importorskip("viser", reason="viser is in the `view` extra")
 msgpack = pytest.importorskip("msgspec").msgpack
 ConnectionClosed = pytest.importorskip("websockets.exceptions").ConnectionClosed
 
-FEW, MANY = 200, 10_000
 CAMERA = {
     "type": "ViewerCameraMessage",
     "wxyz": [1.0, 0.0, 0.0, 0.0],
@@ -85,7 +84,7 @@ def test_only_what_the_page_sends_comes_in(viewed: ViewedRun, monkeypatch: pytes
         assert not shared, "a page is not brought to the internet because a client asks for it"
 
 
-@pytest.mark.parametrize(("count", "seed"), [(FEW, 0), pytest.param(MANY, SEED, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("count", "seed"), [(200, 0), pytest.param(10_000, SEED, marks=pytest.mark.slow)])
 def test_messages_at_random(viewed: ViewedRun, count: int, seed: int, capfd, caplog, recwarn) -> None:
     with showing(viewed) as viewer, connected(viewer) as looker:
         drawn(viewer, 1)

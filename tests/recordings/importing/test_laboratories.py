@@ -1,15 +1,17 @@
-"""Stand-ins for three recordings of public laboratories: webcams with a board, Xvid at wide angles, a mouse."""
+"""`d2 import` without a calibration, and stand-ins for recordings of laboratories: webcams, wide angles, a mouse."""
 
 import json
 import re
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from calibration_writers import Known, toml
-from recorded import Filmed, write_avi
+from recorded import Filmed, Shooting, video, write_avi
 from rigs import arc, held, worst
+from stand_in_recordings import smooth_recording
 
 from d2_plugin.commands.cli import main
 from d2_plugin.durable import read_table
@@ -143,3 +145,72 @@ def test_a_mouse_among_four_small_cameras(mouse: Filmed, tmp_path: Path, refused
         assert off <= 2 * clock["error"] + 1e-9, name
         assert off < 0.5 / 30, name
     assert rig_width(open_recording(tmp_path / "c").cameras.values()) == pytest.approx(0.48, abs=0.01)
+
+
+NEIGHBOURS = ("02", "03", "04", "05")
+
+
+@pytest.fixture(scope="module")
+def soft(tmp_path_factory: pytest.TempPathFactory) -> Filmed:
+    """Videos whose images share hardly a feature."""
+    recording = smooth_recording(NEIGHBOURS, frames=2)
+    return video(recording, tmp_path_factory.mktemp("soft"), {name: Shooting() for name in NEIGHBOURS})
+
+
+@pytest.mark.slow
+def test_videos_become_a_recording_without_a_calibration(
+    shared_data: Callable[[str], Path], tmp_path, capsys, answered
+) -> None:
+    large = open_recording(shared_data("plaza_large"))
+    near = video(select_cameras(large, NEIGHBOURS), tmp_path / "near", {name: Shooting() for name in NEIGHBOURS})
+    truth = {name: large.cameras[name] for name in NEIGHBOURS}
+    apart = float(np.linalg.norm(truth["02"].centre - truth["05"].centre))
+    words = ["import", str(near.videos), "--output", str(tmp_path / "c"), "--offsets", "none", "--exposure", "false"]
+    words += ["--scale", "0.25", "--distance", f"02,05,{apart}", "--intrinsics", str(near.calibration)]
+    said = answered(*words)
+    assert "camera 03: 0." in said
+    assert f"scale: from the distance {apart:g} of 02 and 05" in said
+    found = {camera.name: camera.pinhole() for camera in open_calibration(tmp_path / "c" / "calibration.json").cameras}
+    degrees, share = worst(found, truth)
+    assert degrees < 0.1
+    assert share < 0.005
+    assert rig_width(found.values()) == pytest.approx(rig_width(truth.values()), rel=0.005)
+    told = json.loads((tmp_path / "c" / "calibration.json").read_text())
+    assert {"verdict", "reprojection_error", "points", "doubt_degrees"} <= told["cameras"][0].keys()
+    assert "note  poses were found from the videos; the scale of the world is from the distance" in said
+    assert open_recording(tmp_path / "c").frames == (0, 1)
+    before = (tmp_path / "c" / "calibration.json").read_bytes()
+    assert main(words) == 0  # the same import is read, not solved again
+    assert "camera 03: 0." not in capsys.readouterr().out
+    assert (tmp_path / "c" / "calibration.json").read_bytes() == before
+
+
+def test_cameras_that_share_nothing_are_refused_and_nothing_is_left(soft: Filmed, tmp_path: Path, refused) -> None:
+    words = ["import", str(soft.videos), "--output", str(tmp_path / "c"), "--offsets", "none"]
+    said = refused(*words, "--intrinsics", str(soft.calibration))
+    assert "where camera 0" in said
+    assert "add stills on the way between the cameras (at most 20 degrees apart)" in said
+    assert not (tmp_path / "c").exists()
+
+
+BAD_WORDS = [
+    (["--calibration", "CALIBRATION", "--focal", "700"], r"--calibration and --focal are both given"),
+    (["--unit", "mm"], r"--unit says what a calibration is in, and none is given"),
+    (["--focal", "wide"], r"--focal says 'wide', expected shared, each, a number of pixels"),
+    (["--focal", "02=700"], r"--focal says nothing of camera 03, 04, 05: add NAME=PIXELS"),
+    (["--focal", "09=700"], r"--focal names camera '09', have 02, 03, 04, 05"),
+    (["--focal", "700", "--intrinsics", "CALIBRATION"], r"--intrinsics and --focal both say how the lenses are"),
+    (["--distance", "02,05"], r"--distance says '02,05', expected CAMERA,CAMERA,METRES"),
+    (["--distance", "02,02,1"], r"--distance says '02,02,1', expected"),
+    (["--stills", "FOLDER"], r"--stills .* is no folder with images"),
+]
+
+
+@pytest.mark.parametrize(("words", "says"), BAD_WORDS)
+def test_words_that_say_nothing(soft: Filmed, tmp_path: Path, refused, words: list[str], says: str) -> None:
+    (tmp_path / "empty").mkdir()
+    places = {"CALIBRATION": str(soft.calibration), "FOLDER": str(tmp_path / "empty")}
+    given = [places.get(word, word) for word in words]
+    said = refused("import", soft.videos, "--output", tmp_path / "c", "--offsets", "none", *given)
+    assert re.search(says, said), said
+    assert not (tmp_path / "c").exists()

@@ -1,4 +1,4 @@
-"""When cameras started: timecode, sound, motion, each alone, and what happens where they contradict each other."""
+"""When cameras started: timecode, sound, motion, each alone and against each other; the images of a frame by then."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -10,9 +10,9 @@ import pytest
 from recorded import SOUND_RATE, graded, room_sound
 from refusals import refuses
 
-from d2_plugin.errors import D2Error
 from d2_plugin.recordings import Camera, Recording, open_recording
-from d2_plugin.recordings.importing.clocks import Evidence, _solved, common_clock, given_clock, timecode_seconds
+from d2_plugin.recordings.importing.clocks import Clock, Evidence, _solved, common_clock, given_clock, timecode_seconds
+from d2_plugin.recordings.importing.grid import Grid, grid_of
 from d2_plugin.recordings.importing.motion import Seen, offsets_from_motion, watch
 from d2_plugin.recordings.importing.sound import RATE, Sound, lag_between
 from d2_plugin.recordings.importing.video import VideoFile
@@ -167,8 +167,8 @@ def test_a_camera_of_another_event_is_named() -> None:
 
 
 def test_a_loop_that_does_not_close_is_refused() -> None:
-    with pytest.raises(D2Error, match=r"the sound contradicts itself by .* frames between"):
-        _solved("abc", evidence(ab=0.1, bc=0.1, ac=0.5), 0.04)
+    pairs = evidence(ab=0.1, bc=0.1, ac=0.5)
+    refuses(r"the sound contradicts itself by .* frames between", _solved, "abc", pairs, 0.04)
 
 
 def test_given_offsets_are_in_frames_of_each_camera() -> None:
@@ -176,3 +176,56 @@ def test_given_offsets_are_in_frames_of_each_camera() -> None:
     clocks = given_clock(videos, ("b=-7.5",))
     assert clocks["a"].seconds == 0
     assert clocks["b"].seconds == pytest.approx(-0.15)
+
+
+STEADY = np.arange(60) / 30
+
+
+def grid(began: float = 0.0, other: np.ndarray = STEADY, **asked: object) -> Grid:
+    """Of two cameras that filmed at these times; `b` began so many seconds later."""
+    videos = {}
+    for name, times in (("a", STEADY), ("b", other)):
+        stamps = np.rint(times * 90_000).astype(np.int64)
+        videos[name] = VideoFile(Path("a.mp4"), (64, 48), 0, stamps, Fraction(1, 90_000))
+    return grid_of(videos, {"a": Clock(0, 0.0, "given"), "b": Clock(began, 0.0, "given")}, **asked)
+
+
+def test_cameras_that_expose_together_are_not_late() -> None:
+    found = grid(10 / 30)
+    assert found.rate == 30
+    assert (found.indices["a"][0], found.indices["b"][0]) == (10, 0)
+    assert len(found.indices["a"]) == 50
+    assert found.late == {}
+
+
+def test_half_a_frame_is_kept_and_not_interpolated() -> None:
+    found = grid(-7.5 / 30)
+    late = np.array(list(found.late["b"].values())) * 30
+    assert np.abs(np.abs(late) - 0.5).max() < 1e-3
+    assert max(map(abs, found.late["a"].values())) < 1e-6
+
+
+def test_what_a_camera_dropped_is_left_out_for_all() -> None:
+    found = grid(other=np.delete(STEADY, [20, 21, 22, 40]))
+    assert not {20, 21, 22, 40} & found.indices["a"].keys()
+    assert found.indices["b"][23] == 20
+    assert any("4 of 60 frames left out" in note for note in found.notes)
+
+
+def test_a_slower_rate_takes_every_other_image() -> None:
+    found = grid(rate=15, times=(0.2, 1.0))
+    assert list(found.indices["a"].values()) == list(range(6, 31, 2))
+    assert list(found.indices["a"]) == list(range(3, 16))
+
+
+@pytest.mark.parametrize(
+    ("asked", "says"),
+    [
+        ({"times": (9.0, 10.0)}, r"--times asks for 9 to 10 seconds and the videos share 0 to 1.97: choose within"),
+        ({"times": (1.0,)}, r"--times must be FIRST,LAST"),
+        ({"frames": (3, 99)}, r"--frames asks for 99 and the cameras have 0 to 59 in common: choose within"),
+        ({"began": 5.0}, r"camera a stopped 3\.0\d seconds before camera b began: leave one out"),
+    ],
+)
+def test_what_nobody_recorded_is_refused(asked: dict, says: str) -> None:
+    refuses(says, grid, **asked)

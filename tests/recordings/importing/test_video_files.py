@@ -1,20 +1,18 @@
 """A video as its container describes it: time stamps, turn, timecode, and its frames in any order."""
 
-from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from prior_cases import showing
 from recorded import write_avi, write_video
+from refusals import refuses
+from stand_in_recordings import smooth_recording
 
-from d2_plugin.errors import D2Error
 from d2_plugin.recordings import open_recording, select_cameras, select_frames
-from d2_plugin.recordings.cameras.camera import CalibratedCamera, pinhole
-from d2_plugin.recordings.cameras.lens import Lens
-from d2_plugin.recordings.importing.source import Cut, VideosSource
 from d2_plugin.recordings.importing.steady import steadiness
 from d2_plugin.recordings.importing.video import Decoder, read_video
-from d2_plugin.recordings.recording import Recording, Source
+from d2_plugin.recordings.recording import Recording
 from d2_plugin.recordings.selection import spread
 
 pytest.importorskip("av")
@@ -132,32 +130,26 @@ def wall(count: int, shift: int = 0, gain: float = 1.0) -> list[np.ndarray]:
 
 
 @pytest.mark.parametrize(("shift", "gain", "moved", "drift"), [(0, 1, 0, 0), (12, 1, 12, 0), (0, 1.25, 0, 0.25)])
-def test_a_camera_that_was_moved_or_drifts_is_noticed(shift, gain, moved, drift, tmp_path) -> None:
-    path = write_video(tmp_path / "a.mp4", wall(24, shift, gain), [i / 24 for i in range(24)])
-    camera = CalibratedCamera("a", 160, 120, Lens(pinhole(160, 160, 80, 60)), np.eye(4))
-    source = VideosSource(
-        {"a": read_video(path)}, {"a": {i: i for i in range(24)}}, {"a": camera}, {"a": Cut(0, 0, 160, 120)}
-    )
-    recording = Recording("walls", source.pinholes(), tuple(range(24)), 24.0, source)
-    steady = steadiness(source.checked(recording))["a"]
+def test_a_camera_that_was_moved_or_drifts_is_noticed(shift, gain, moved, drift) -> None:
+    views = wall(24, shift, gain)
+    recording = smooth_recording(("a",), 24, 160, 120)
+    steady = steadiness(showing(recording, {"image": lambda camera, frame: views[frame]}))["a"]
     assert 160 * steady.moved == pytest.approx(moved, abs=1)
     assert steady.drift == pytest.approx(drift, abs=0.02)
     assert not moved or steady.between[0] <= 0.5 <= steady.between[1]
 
 
-@dataclass(frozen=True)
-class Bumped(Source):
-    """A recording whose cameras are turned from a frame on."""
+def bumped(recording: Recording, first: int, degrees: float) -> Recording:
+    """The recording, whose cameras are turned from a frame on."""
+    cv2, axis = pytest.importorskip("cv2"), np.array([0.3, -0.2, 0.93])
 
-    recording: Recording
-    first: int
-    degrees: float
+    def image(camera: str, frame: int) -> np.ndarray:
+        K = recording.cameras[camera].K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
+        turn = K @ cv2.Rodrigues(np.deg2rad(degrees) * axis)[0] @ np.linalg.inv(K)
+        image = recording.image(camera, frame)
+        return cv2.warpPerspective(image, turn, image.shape[1::-1]) if frame >= first else image
 
-    def image(self, camera: str, frame: int) -> np.ndarray:
-        cv2, image = pytest.importorskip("cv2"), self.recording.image(camera, frame)
-        K, axis = self.recording.cameras[camera].K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]], np.array([0.3, -0.2, 0.93])
-        turn = K @ cv2.Rodrigues(np.deg2rad(self.degrees) * axis)[0] @ np.linalg.inv(K)
-        return cv2.warpPerspective(image, turn, image.shape[1::-1]) if frame >= self.first else image
+    return showing(recording, {"image": image})
 
 
 @pytest.mark.parametrize(("name", "camera"), [("studio", "02"), ("dome", "03")])
@@ -167,7 +159,7 @@ def test_a_camera_that_is_bumped_by_half_a_degree_is_noticed_though_people_walk(
     recording = select_frames(whole, spread(whole.frames, 9))
     first = recording.frames[5]
     assert steadiness(recording)[camera].moved == 0
-    steady = steadiness(replace(recording, source=Bumped(whole, first, 0.5)))[camera]
+    steady = steadiness(bumped(recording, first, 0.5))[camera]
     assert steady.moved > 0
     assert steady.between[0] < first / recording.fps <= steady.between[1]
 
@@ -185,5 +177,4 @@ def test_a_camera_that_is_bumped_by_half_a_degree_is_noticed_though_people_walk(
 def test_playlists_and_scripts_are_no_videos_and_lead_nowhere(text: str, tmp_path: Path) -> None:
     write_video(tmp_path / "a.mp4", images(5), [i / 25 for i in range(5)])
     (tmp_path / "b.mp4").write_text(text)
-    with pytest.raises(D2Error, match=r"b\.mp4 (is no video in an MP4, MOV, .* container|\(Invalid data)"):
-        read_video(tmp_path / "b.mp4")
+    refuses(r"b\.mp4 (is no video in an MP4, MOV, .* container|\(Invalid data)", read_video, tmp_path / "b.mp4")

@@ -5,6 +5,7 @@ import torch
 from tiny import make_adapter, make_model, make_views
 
 from d2_plugin.backbones.model import SplatModel
+from d2_plugin.backbones.yang4d import Yang4D, Yang4DSettings
 from d2_plugin.protocol import View
 from d2_plugin.recordings import Camera, Recording
 from d2_plugin.viewing.export.scene import ExportScene, export_scene
@@ -42,6 +43,19 @@ def sharp_model(backbone: str, count: int = 400, **options: object) -> SplatMode
     return model
 
 
+def with_harmonics(count: int = 400, in_time: bool = False) -> SplatModel:
+    """4D Gaussians whose colours differ by direction and, `in_time`, by time, before a sky."""
+    plain, degree, generator = sharp_model("yang4d", count), 2 if in_time else 0, torch.Generator().manual_seed(3)
+    rows = {name: value.detach() for name, value in plain.gaussians.parameters.items()}
+    rows["harmonics"] = 0.2 * torch.randn(count, 16 * (degree + 1) - 1, 3, generator=generator)
+    chosen = Yang4DSettings(sh_degree=3, sh_time_degree=degree, background=in_time)
+    model = Yang4D(rows, chosen, 2.0, DURATION)
+    if in_time:
+        with torch.no_grad():
+            model.background.harmonics.normal_(0, 0.2, generator=generator)
+    return model
+
+
 def larger(view: View) -> View:
     """The tiny view in images of 160 x 120, off centre so that the principal point matters."""
     scale = torch.tensor([[WIDTH / view.width], [HEIGHT / view.height], [1.0]])
@@ -67,18 +81,14 @@ def make_scene(
     return export_scene(ViewedRun(name, recording, tuple(train), (held_out,), make_adapter(model)))
 
 
-def rasterized(
-    model: SplatModel, camera: int, time: float, turned: torch.Tensor | None = None, finer: int = 1
-) -> dict[str, np.ndarray]:
+def rasterized(model: SplatModel, camera: int, time: float, finer: int = 1) -> dict[str, np.ndarray]:
     """What our rasterizer draws: color [H, W, 3] in 0..1, expected depth and alpha [H, W].
 
-    `turned` [4, 4] takes the camera's axes to those of another camera at its place; images have `finer` times as many
-    pixels each way."""
+    Images have `finer` times as many pixels each way."""
     view = larger(make_views()[camera])
     K = view.K * torch.tensor([[finer], [finer], [1.0]])
-    T_camera_world = view.T_camera_world if turned is None else turned @ view.T_camera_world
     with torch.no_grad():
-        render = model.render(View(view.camera, 0, time, T_camera_world, K, finer * WIDTH, finer * HEIGHT))
+        render = model.render(View(view.camera, 0, time, view.T_camera_world, K, finer * WIDTH, finer * HEIGHT))
     depth = render.depth_sum / render.alpha.clamp(min=1e-4)
     return {"color": render.color.clamp(0, 1).numpy(), "depth": depth.numpy(), "opacity": render.alpha.numpy()}
 

@@ -8,27 +8,26 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from oracles.export_files import ReadPage, covariances_from, covariances_of, read_still_ply
-from viewing.export.scenes import DURATION, make_scene, sharp_model
+from refusals import refuses
+from viewing.export.scenes import DURATION, make_scene, sharp_model, with_harmonics
 
-from d2_plugin.backbones.yang4d import Yang4D, Yang4DSettings
-from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.moving import Harmonics, LinearMotion, MovingGaussians
 from d2_plugin.gaussians.slicing import slice_gaussians
+from d2_plugin.gaussians.spherical_harmonics import SH_C0
+from d2_plugin.runs.start import make_view
+from d2_plugin.viewing.checkpoints import read_ply
+from d2_plugin.viewing.checkpoints.files import columns
+from d2_plugin.viewing.export import compact
 from d2_plugin.viewing.export.coded import encode, seen_rows
 from d2_plugin.viewing.export.export import Export, write_export
 from d2_plugin.viewing.export.keys import STILL, bake, cholesky, morton_order, state_at
 from d2_plugin.viewing.export.page import to_json, write_page
+from d2_plugin.viewing.export.ply import scales_and_rotations, write_ply
 
 TIMES = (0.0, 0.13, 0.5)
-
-
-def with_harmonics(count: int) -> Yang4D:
-    """4D Gaussians with harmonics of degree 3."""
-    plain = sharp_model("yang4d", count)
-    rows = {name: value.detach() for name, value in plain.gaussians.parameters.items()}
-    rows["harmonics"] = 0.2 * torch.randn(len(plain), 15, 3, generator=torch.Generator().manual_seed(3))
-    return Yang4D(rows, Yang4DSettings(sh_degree=3, background=False), 2.0, DURATION)
 
 
 class TestStraightLines:
@@ -80,19 +79,18 @@ class TestThePage:
         assert [page.model["name"] for page in pages] == ["one", "two"]
         assert [len(page.coefficients) for page in pages] == [page.model["count"] for page in pages]
         assert pages[0].model["count"] < 110 < pages[1].model["count"]
-        kept = pages[0].header["recorded"]
-        assert list(kept) == ["right"], "the held-out camera"
-        assert [place for place, _, _ in kept["right"]] == list(range(12))
+        kept = pages[0].header["recorded"]["right"]  # the held-out camera
+        assert [place for place, _, _ in kept] == list(range(12))
         cv2 = pytest.importorskip("cv2", reason="opencv is in the `image` extra")
-        _, at, length = kept["right"][0]
+        _, at, length = kept[0]
         image = cv2.imdecode(np.frombuffer(pages[0].raw[at : at + length], np.uint8), cv2.IMREAD_COLOR)
         assert np.abs(image.astype(int) - 60).max() <= 2, "what the recording holds there"
         assert any("12 recorded images of the cameras right" in line for line in about)
 
     def test_runs_of_two_recordings_are_not_compared(self, tmp_path: Path) -> None:
         scenes = [make_scene(sharp_model("yang4d", 50), "a", names) for names in (("l", "m", "r"), ("l", "m", "s"))]
-        with pytest.raises(D2Error, match="of different recordings: compare runs of one recording"):
-            write_page(scenes, tmp_path / "scene.html")
+        says = "of different recordings: compare runs of one recording"
+        refuses(says, write_page, scenes, tmp_path / "scene.html")
 
     @pytest.mark.parametrize("backbone", ["yang4d", "deform"])
     def test_a_reader_finds_the_gaussians_within_a_hundredth_of_a_pixel(self, tmp_path: Path, backbone: str) -> None:
@@ -121,8 +119,8 @@ class TestThePage:
     def test_a_page_of_somebody_else_is_not_replaced(self, tmp_path: Path) -> None:
         scene, path = make_scene(sharp_model("yang4d", 50)), tmp_path / "scene.html"
         path.write_text("<p>mine</p>")
-        with pytest.raises(D2Error, match="was not written by `d2 export` and is kept: choose another place"):
-            write_export([scene], Export((Path(),)), tmp_path)
+        says = "was not written by `d2 export` and is kept: choose another place"
+        refuses(says, write_export, [scene], Export((Path(),)), tmp_path)
         assert path.read_text() == "<p>mine</p>"
         path.unlink()
         for _ in range(2):  # its own page is replaced
@@ -178,8 +176,8 @@ class TestOthersReadIt:
 
     def test_a_deformation_field_has_no_place_in_it(self, tmp_path: Path) -> None:
         pytest.importorskip("fourdgs", reason="fourdgs is in the `formats` extra")
-        with pytest.raises(D2Error, match="this model moves by a network: choose --format html or ply"):
-            write_export([make_scene(sharp_model("deform"))], Export((Path(),), "4dgs"), tmp_path)
+        scenes, says = [make_scene(sharp_model("deform"))], "this model moves by a network: choose --format html or ply"
+        refuses(says, write_export, scenes, Export((Path(),), "4dgs"), tmp_path)
 
     @pytest.mark.parametrize("kind", ["sog", "spz", "glb"])
     def test_others_read_what_splat_transform_writes(self, tmp_path: Path, kind: str) -> None:
@@ -209,5 +207,115 @@ class TestOthersReadIt:
 
     def test_without_the_converter_one_sentence_says_how_to_get_it(self, tmp_path: Path, monkeypatch) -> None:
         monkeypatch.setenv("PATH", str(tmp_path))
-        with pytest.raises(D2Error, match="npm install -g @playcanvas/splat-transform"):
-            write_export([make_scene(sharp_model("yang4d", 50))], Export((Path(),), "sog", frames=(0,)), tmp_path)
+        scenes, asked = [make_scene(sharp_model("yang4d", 50))], Export((Path(),), "sog", frames=(0,))
+        refuses("npm install -g @playcanvas/splat-transform", write_export, scenes, asked, tmp_path)
+
+
+class TestFewer:
+    """`d2 export --keep`: what goes is what images would miss least."""
+
+    def test_the_energy_of_a_gaussian_is_what_the_image_differs_by_without_it(self) -> None:
+        model = sharp_model("yang4d", 24)
+        viewed = make_scene(model).viewed
+        view, generator = make_view(viewed.recording, "middle", 4), torch.Generator().manual_seed(0)
+        energies = torch.zeros(24)
+        for _ in range(100):
+            compact._add_energies(energies, viewed.backbone, view, generator)
+        with torch.no_grad():
+            splats = viewed.backbone.slice_at(view)
+            whole = compact._color(viewed.backbone, view, splats.opacities)
+            true = torch.zeros(24)
+            for place, row in enumerate(splats.rows):
+                without = splats.opacities.clone()
+                without[place] = 0
+                true[row] = (compact._color(viewed.backbone, view, without) - whole).square().sum()
+        assert torch.equal(energies == 0, true == 0)
+        seen = true > 0.01 * true.max()
+        assert seen.sum() > 10
+        assert (energies[seen] / 100 / true[seen]).log2().abs().median() < 0.3
+        assert np.corrcoef(energies.argsort().argsort(), true.argsort().argsort())[0, 1] > 0.95
+
+    def test_a_checkpoint_of_another_trainer_is_refused(self) -> None:
+        viewed = make_scene(sharp_model("yang4d")).viewed
+        del viewed.backbone.model
+        refuses("tiny is no run of `d2 train`: leave out --keep", compact.compacted, viewed, 0.5)
+
+
+def random_gaussians(count: int, seed: int = 0, spread: float = 3.0) -> tuple[torch.Tensor, ...]:
+    """Random means, covariances, colours and opacities."""
+    generator = torch.Generator().manual_seed(seed)
+    factors = torch.linalg.qr(torch.randn(count, 3, 3, generator=generator, dtype=torch.float64))[0]
+    scales = torch.exp(spread * (torch.rand(count, 3, generator=generator, dtype=torch.float64) - 0.5))
+    matrices = factors @ torch.diag_embed(scales**2) @ factors.mT
+    packed = matrices[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
+    means, colors = torch.randn(count, 3, generator=generator), torch.rand(count, 3, generator=generator)
+    return means, packed, colors, torch.rand(count, generator=generator)
+
+
+def write_still(path: Path, *parts: torch.Tensor) -> None:
+    """A file of means, covariances, colours and opacities."""
+    means, covariances, colors, opacities = (part.double() for part in parts)
+    still = MovingGaussians(means, covariances, opacities, Harmonics((colors[:, None] - 0.5) / SH_C0, 0))
+    write_ply(path, still, scales_and_rotations(covariances))
+
+
+def off(rebuilt: torch.Tensor, true: torch.Tensor) -> float:
+    """The largest difference of covariances [M, 6] in sizes of theirs."""
+    return float(((rebuilt - true).abs() / true.abs().amax(1, keepdim=True)).max())
+
+
+def test_a_viewer_reads_back_the_gaussians(tmp_path: Path) -> None:
+    means, covariances, colors, opacities = random_gaussians(50)
+    opacities = 0.02 + 0.9 * opacities
+    path = tmp_path / "frame_00000.ply"
+    write_still(path, means, covariances, colors, opacities)
+    header = path.read_bytes().partition(b"end_header\n")[0].decode("ascii").splitlines()
+    assert header[:2] == ["ply", "format binary_little_endian 1.0"]
+    assert "element vertex 50" in header
+    order = "x y z nx ny nz f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3"
+    assert [line for line in header if "property" in line] == [f"property float {name}" for name in order.split()]
+    rotations = columns(read_ply(path), "rot")
+    torch.testing.assert_close(rotations.norm(dim=1), torch.ones(50))
+    read = read_still_ply(path)
+    assert torch.equal(read.positions, means.double())
+    torch.testing.assert_close(0.5 + SH_C0 * read.harmonics.coefficients[:, 0], colors.double(), atol=1e-6, rtol=0)
+    torch.testing.assert_close(read.opacities, opacities.double(), atol=1e-6, rtol=0)
+    assert off(read.covariances, covariances) < 2e-6
+
+
+def test_harmonics_lie_where_viewers_look(tmp_path: Path) -> None:
+    """After the constant one all coefficients of red, then of green, then of blue."""
+    means, covariances, *_ = random_gaussians(5)
+    coefficients = torch.randn(5, 16, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    still = MovingGaussians(means.double(), covariances, torch.full((5,), 0.5).double(), Harmonics(coefficients, 3))
+    write_ply(tmp_path / "a.ply", still, scales_and_rotations(covariances))
+    rest = coefficients[:, 1:].transpose(1, 2).flatten(1)
+    torch.testing.assert_close(columns(read_ply(tmp_path / "a.ply"), "f_rest"), rest.float())
+
+
+def test_what_no_rasterizer_draws_is_left_out(tmp_path: Path) -> None:
+    means, covariances, colors, _ = random_gaussians(6)
+    opacities = torch.tensor([0.5, 1 / 254, 1 / 256, 0.0, 1.0, 0.5])
+    means[5, 1] = torch.nan
+    write_still(tmp_path / "a.ply", means, covariances, colors, opacities)
+    rows = read_ply(tmp_path / "a.ply")
+    assert torch.equal(rows["x"], means[[0, 1, 4], 0])
+    assert all(torch.isfinite(column).all() for column in rows.values()), "an opacity of 1 too has a logit"
+    write_still(tmp_path / "a.ply", means, covariances, colors, 0 * opacities)
+    assert b"element vertex 0\n" in (tmp_path / "a.ply").read_bytes()
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 2**31), st.floats(0, 12))
+def test_rotations_rebuild_the_covariance(seed: int, spread: float) -> None:
+    _, covariances, *_ = random_gaussians(8, seed, spread)
+    assert off(covariances_from(*scales_and_rotations(covariances)), covariances) < 1e-10
+
+
+def test_flat_and_round_gaussians_have_finite_scales() -> None:
+    flat = torch.tensor([[1.0, 0, 0, 1.0, 0, 0], [1.0, 0, 0, 1.0, 0, 1.0], [1e-30, 0, 0, 1e-30, 0, 1e-30]]).double()
+    flat[0, 5] = -1e-8  # rounding of a float32 covariance
+    scales, quaternions = scales_and_rotations(flat)
+    assert torch.isfinite(scales.log()).all()
+    assert torch.isfinite(quaternions).all()
+    torch.testing.assert_close(scales[1], torch.ones(3, dtype=torch.float64))
