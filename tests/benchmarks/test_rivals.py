@@ -9,10 +9,10 @@ import pytest
 import torch
 from at_once import measured_at_once
 from numpy.lib.stride_tricks import sliding_window_view
-from tiny import TinyStore, make_adapter, make_model
+from tiny import BACKBONES, TinyStore, make_adapter, make_model, make_views
 from torch import Tensor
 
-from benchmarks.rivals.patch_norm import patch_norm_loss
+from benchmarks.rivals.patch_norm import PatchNorm, PatchNormConfig, patch_norm_loss
 from benchmarks.rivals.pearson import pearson_depth_loss
 from benchmarks.rivals.scale_shift import scale_shift_loss
 from benchmarks.rivals.sparse_points import Seen, sparse_point_loss
@@ -20,7 +20,9 @@ from benchmarks.rivals.sweep import best_change
 from benchmarks.rivals.table import RIVAL_PRESETS, RIVALS
 from d2_plugin import D2Config, D2Hooks
 from d2_plugin.errors import D2Error
-from d2_plugin.hooks import Hook, HookConfig
+from d2_plugin.hooks import Context, Hook, HookConfig
+from d2_plugin.hooks.prior import PriorLoader
+from d2_plugin.protocol import View
 from d2_plugin.runs.ablation.ablate import ablate
 from d2_plugin.runs.ablation.presets import PRESETS, rows_named
 from d2_plugin.runs.rows import read_rows
@@ -132,6 +134,30 @@ def test_where_nothing_can_be_told_there_is_no_gradient(name: str, dtype: torch.
     found.backward()
     assert value is None or found.item() == pytest.approx(value, abs=1e-6)
     assert (d.grad == 0).all()
+
+
+class OneMap:
+    """What `Inputs` knows of depth: a slope."""
+
+    def inverse_depth(self, view: View) -> Tensor:
+        return torch.linspace(1, 2, view.width).expand(view.height, -1)
+
+
+@pytest.mark.parametrize("backbone", BACKBONES)
+@pytest.mark.parametrize(
+    ("soft_start", "wanted"), [(10, {"positions"}), (0, {"positions", "opacity_logits"})], ids=["hard", "and soft"]
+)
+def test_hard_depth_moves_centres_and_soft_depth_fades_gaussians_and_nothing_else_learns(
+    backbone: str, soft_start: int, wanted: set[str]
+) -> None:
+    """DNGaussian's code freezes all but positions for one term, and all but opacities for the other."""
+    adapter = make_adapter(make_model(backbone=backbone))
+    hook = PatchNorm(PatchNormConfig(soft_start=soft_start), OneMap())
+    context = Context(5, adapter, make_views()[:1], PriorLoader(TinyStore()), torch.Generator().manual_seed(0))
+    loss = hook.loss(context)
+    loss.backward()
+    trained = adapter.trained()
+    assert {name for name, value in trained.items() if value.grad is not None and value.grad.any()} == wanted
 
 
 def test_every_rival_trains_on_one_prior_and_says_its_name(saved_room: Callable[..., Path], tmp_path: Path) -> None:
