@@ -22,9 +22,9 @@ from torch import Tensor
 
 from d2_plugin.backbones.model import SplatModel
 from d2_plugin.backbones.trainer import Trainer, TrainSettings
-from d2_plugin.config import D2Config, DensifyConfig, MotionConfig
+from d2_plugin.config import D2Config, DensifyConfig, MotionConfig, ParallaxConfig
 from d2_plugin.hooks.densify import CHANGED, Densify, MovingPixels
-from d2_plugin.hooks.hook import Context
+from d2_plugin.hooks.hook import Context, HookConfig
 from d2_plugin.hooks.motion import Motion
 from d2_plugin.hooks.prior import RIM, PriorLoader
 from d2_plugin.plugin import D2Hooks
@@ -154,13 +154,6 @@ class TestWhereThereIsNothingToLearnFrom:
         for views, known in (([SECOND], [FIRST, SECOND]), ([FIRST], [FIRST])):
             assert Motion(MotionConfig()).loss(context_of(adapter, Halfway(), views, known)) is None
 
-    def test_nor_does_a_backbone_without_colours_which_is_logged_once(self, caplog: pytest.LogCaptureFixture) -> None:
-        adapter = make_adapter(make_model())
-        adapter.colors = None
-        hook, context = Motion(MotionConfig()), context_of(adapter, Halfway(), [FIRST], [FIRST, SECOND])
-        assert [hook.loss(context), hook.loss(context)] == [None, None]
-        assert len([r for r in caplog.records if "colors" in r.message]) == 1
-
 
 class TestInsertionHalfway:
     def points(self, insert: bool) -> Tensor:
@@ -187,15 +180,16 @@ class TestInsertionHalfway:
         assert not (self.points(False)[:, 0] == 0.25).any()
 
 
-def trainer(motion: MotionConfig | None) -> Trainer:
+def trainer(**more: HookConfig) -> Trainer:
     def attach(model: object) -> D2Hooks:
-        return D2Hooks(replace(ALL_HOOKS, motion=motion), make_adapter(model), Halfway())
+        return D2Hooks(replace(ALL_HOOKS, **more), make_adapter(model), Halfway())
 
     return Trainer(make_model(), TinyFrames(), TrainSettings(iterations=18, seed=3), attach)
 
 
-def test_a_resumed_run_is_bitwise_the_uninterrupted_one_and_not_that_without_the_hook() -> None:
-    whole, first, second, without = (trainer(MotionConfig() if i < 3 else None) for i in range(4))
+@pytest.mark.parametrize("hook", [{"motion": MotionConfig()}, {"parallax": ParallaxConfig(every=1)}])
+def test_a_resumed_run_is_bitwise_the_uninterrupted_one_and_not_that_without_the_hook(hook: dict) -> None:
+    whole, first, second, without = (trainer(**(hook if i < 3 else {})) for i in range(4))
     whole.run()
     first.run(9)
     second.load_state_dict(first.state_dict())

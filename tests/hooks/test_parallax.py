@@ -21,6 +21,7 @@ from tiny import (
 )
 from torch import Tensor
 
+from d2_plugin.backbones.model import SplatModel
 from d2_plugin.config import D2Config, ParallaxConfig
 from d2_plugin.hooks import parallax
 from d2_plugin.hooks.hook import Context
@@ -57,19 +58,11 @@ def loss_of(adapter: object, views: list[View], store: object | None = None, **c
     return Parallax(ParallaxConfig(**changes)).loss(context_of(adapter, views, store))
 
 
-class NoBackground:
-    """An adapter whose trainer's background is not known."""
-
-    behind = None
-
-    def __init__(self, adapter: object) -> None:
-        self.adapter = adapter
-
-    def __getattr__(self, name: str) -> object:
-        return getattr(self.adapter, name)
-
-    def __len__(self) -> int:
-        return len(self.adapter)
+def without_background(model: SplatModel) -> object:
+    """The adapter of a trainer whose background is not known."""
+    adapter = make_adapter(model)
+    adapter.behind = None
+    return adapter
 
 
 def turned(degrees: float, x: float) -> View:
@@ -176,7 +169,7 @@ def test_from_the_same_place_all_that_both_know_is_seen() -> None:
 
 
 def test_where_nothing_is_drawn_before_an_unknown_background_nothing_is_lost() -> None:
-    adapter = NoBackground(make_adapter(model_far_away()))
+    adapter = without_background(model_far_away())
     assert float(loss_of(adapter, [LEFT, RIGHT]).detach()) == pytest.approx(0, abs=1e-6)
 
 
@@ -186,7 +179,7 @@ def test_what_floats_before_a_surface_gets_fainter() -> None:
         model.gaussians["positions"][:] = torch.tensor([[-0.4, 0.0, 1.5]])  # in no known pixel of the left view
         model.gaussians["log_scales"].fill_(math.log(0.2))
         model.gaussians["base_colors"].fill_(1.7)
-    loss = loss_of(NoBackground(make_adapter(model)), [LEFT, RIGHT])
+    loss = loss_of(without_background(model), [LEFT, RIGHT])
     loss.backward()
     assert float(loss.detach()) > 0.01
     assert model.gaussians["opacity_logits"].grad > 0
@@ -248,16 +241,6 @@ def test_what_is_in_sight_follows_from_the_instants_that_are_known_and_not_from_
     assert not torch.equal(first, later)
 
 
-def test_a_resumed_run_is_bitwise_the_uninterrupted_one() -> None:
-    config = D2Config(parallax=ParallaxConfig(every=1))
-    whole, first, second = (make_trainer(config, iterations=12) for _ in range(3))
-    whole.run()
-    first.run(5)
-    second.load_state_dict(first.state_dict())
-    second.run()
-    assert same(parameters(whole), parameters(second))
-
-
 class Nothing(TinyStore):
     """A store that knows nothing of the right camera."""
 
@@ -275,7 +258,7 @@ def test_there_is_no_loss_where_nothing_is_known(views: list[View], store: objec
 
 
 def test_a_backbone_without_colours_is_told_once(caplog: pytest.LogCaptureFixture) -> None:
-    adapter, hook = NoBackground(make_adapter(make_model())), Parallax(ParallaxConfig())
+    adapter, hook = make_adapter(make_model()), Parallax(ParallaxConfig())
     adapter.colors = None
     for step in (2, 4):
         assert hook.loss(context_of(adapter, [LEFT, RIGHT], step=step)) is None
