@@ -7,16 +7,8 @@ import numpy as np
 
 from benchmarks.stereo_rigs import sample_nearest
 from d2_plugin.priors.geometry import CONTINUOUS, Projection, ViewPair, view_pair, viewing_rays
+from d2_plugin.priors.stereo.filtering import precision
 from d2_plugin.priors.stereo.filtering.confirm import NUDGE, REPROJECTION_MAX
-from d2_plugin.priors.stereo.filtering.precision import (
-    FLATTEST,
-    FLOOR,
-    GRAY_NOISE,
-    MATCHING,
-    OF_SCATTER,
-    OF_SPREAD,
-    PER_INCOHERENCE,
-)
 from d2_plugin.priors.stereo.settings import StereoSettings
 from d2_plugin.recordings.recording import Camera
 
@@ -169,10 +161,12 @@ def sigma(
     known = (depth > 0) & (parallax > 0) & np.isfinite(depth) & ~np.isnan(coherence)
     known &= np.isfinite(spread) & ~np.isnan(gradient)
     coherence, spread = (np.where(known, map_, 0) for map_ in (coherence, spread))
-    pixels = MATCHING + GRAY_NOISE / np.where(known, np.maximum(gradient, FLATTEST), 1)
-    pixels = pixels + PER_INCOHERENCE * (1 - np.clip(coherence, 0, 1))
+    pixels = precision.MATCHING + precision.GRAY_NOISE / np.where(known, np.maximum(gradient, precision.FLATTEST), 1)
+    pixels = pixels + precision.PER_INCOHERENCE * (1 - np.clip(coherence, 0, 1))
     matching = pixels / np.where(known, parallax, 1)
-    variance = matching**2 + (OF_SCATTER * scatter) ** 2 + (OF_SPREAD * spread) ** 2 + FLOOR**2
+    variance = (
+        matching**2 + (precision.OF_SCATTER * scatter) ** 2 + (precision.OF_SPREAD * spread) ** 2 + precision.FLOOR**2
+    )
     return np.where(known, np.sqrt(variance), np.inf).astype(np.float32)
 
 
