@@ -155,9 +155,13 @@ def test_the_unit_of_length_does_not_matter(rig: Rig, native: Maps, scale: float
     assert np.median(np.abs(other - metres)[metres > 0] / metres[metres > 0]) < 1e-3
 
 
-def upside_down_pair(disparity: int) -> tuple[list[np.ndarray], list[Camera], float]:
-    """A wall parallel to two cameras of which the second one stands on its head; and the wall's depth."""
-    rng = np.random.default_rng(0)
+def test_the_centre_of_pixel_i_is_at_i_plus_one_half() -> None:
+    """Of a wall parallel to two cameras of which the second one stands on its head.
+
+    Turned by 180 degrees about (W/2, H/2) pixel i falls on W - 1 - i; with any other centre the match is a pixel off,
+    which here is a tenth of the depth.
+    """
+    rng, disparity = np.random.default_rng(0), 10
     coarse = rng.normal(0, 1, (12, 24)).repeat(8, 0).repeat(8, 1)
     texture = np.clip(128 + 40 * coarse + 30 * rng.normal(0, 1, coarse.shape), 0, 255).astype(np.uint8)
     left, right = texture[:, :160], np.ascontiguousarray(texture[::-1, disparity : 160 + disparity][:, ::-1])
@@ -165,15 +169,8 @@ def upside_down_pair(disparity: int) -> tuple[list[np.ndarray], list[Camera], fl
     turned = np.diag([-1.0, -1.0, 1.0, 1.0])
     turned[0, 3] = 0.4  # the camera centre is .4 to the right, seen from a camera that is turned by 180 degrees
     cameras = [Camera("left", 160, 96, K, np.eye(4)), Camera("right", 160, 96, K, turned)]
-    return [np.ascontiguousarray(left), right], cameras, 150 * 0.4 / disparity
-
-
-def test_the_centre_of_pixel_i_is_at_i_plus_one_half() -> None:
-    # Turned by 180 degrees about (W/2, H/2) pixel i falls on W - 1 - i; with any other centre the match is a pixel off,
-    # which here is a tenth of the depth.
-    images, cameras, depth = upside_down_pair(disparity=10)
-    (found, cost), (back, _) = patchmatch(images, cameras, (2.0, 20.0))
-    inner = np.s_[10:-10, 20:-20]
+    (found, cost), (back, _) = patchmatch([np.ascontiguousarray(left), right], cameras, (2.0, 20.0))
+    depth, inner = 150 * 0.4 / disparity, np.s_[10:-10, 20:-20]
     assert np.median(np.abs(found[inner] / depth - 1)) < 5e-4
     assert np.median(np.abs(back[inner] / depth - 1)) < 5e-4
     assert np.median(cost[inner]) < 1e-3

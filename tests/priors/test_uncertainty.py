@@ -23,8 +23,6 @@ cv2 = pytest.importorskip("cv2")
 
 SETTINGS = AlignSettings()
 
-SEEDS = range(4)
-
 
 class Scene(NamedTuple):
     """One view of the rendered room; maps [H, W]."""
@@ -40,7 +38,7 @@ class Scene(NamedTuple):
 
 @pytest.fixture(scope="module")
 def scenes() -> list[Scene]:
-    return [room(seed) for seed in SEEDS]
+    return [room(seed) for seed in range(4)]
 
 
 def room(seed: int) -> Scene:
