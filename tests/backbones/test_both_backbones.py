@@ -26,7 +26,7 @@ from tiny import (
 
 from d2_plugin import D2Config, D2Error, D2Hooks
 from d2_plugin.backbones.densify import DensifySettings, grow, prune
-from d2_plugin.backbones.model import SplatModel, settled
+from d2_plugin.backbones.model import SplatModel
 from d2_plugin.backbones.starting import nearest_neighbour_scales
 from d2_plugin.backbones.yang4d import create
 from d2_plugin.gaussians import spherical_harmonics as sh
@@ -156,14 +156,6 @@ def test_a_run_comes_to_rest_at_its_end(backbone: str) -> None:
     assert late == {**first, "positions": pytest.approx(first["positions"] * 0.01**0.7)}
     assert end == pytest.approx({**{n: rate / 20 for n, rate in first.items()}, "positions": first["positions"] / 2000})
     assert rates(2600) == end
-
-
-@pytest.mark.parametrize("iterations", [0, 1, 10, 100, 1000, 30_000])
-def test_a_short_run_learns_to_its_last_steps(iterations: int) -> None:
-    shares = [settled(step, iterations) for step in range(iterations + 1)]
-    assert shares == sorted(shares, reverse=True)
-    assert shares[-1] == 0.05
-    assert shares.count(1.0) == pytest.approx(iterations - 0.3 * iterations * min(iterations / 2000, 1), abs=1.01)
 
 
 def test_what_hardly_shows_is_left_out_at_the_end_of_a_run(backbone: str) -> None:

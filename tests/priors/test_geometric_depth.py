@@ -10,7 +10,7 @@ from prior_cases import camera_at
 from refusals import refuses
 
 from benchmarks.stereo_rigs import textured_rig
-from d2_plugin.priors.geometry import check_depth_range, check_views, pixel_grid, view_pair, viewing_rays
+from d2_plugin.priors.geometry import check_depth_range, check_views, view_pair
 from d2_plugin.priors.settings import StereoSettings
 from d2_plugin.priors.stereo.depth_range import depth_bounds
 from d2_plugin.priors.stereo.filtering.filter import GeometricDepth
@@ -215,14 +215,3 @@ def test_images_that_do_not_belong_to_the_cameras_are_refused() -> None:
     refuses("one image per camera", check_views, [image], pair)
     refuses("at least 2 cameras", check_views, [image], pair[:1])
     refuses("camera b is 32x24 pixels", check_views, [image, image[::2, ::2]], pair)
-
-
-def test_the_ray_of_a_pixel_projects_back_to_it_even_where_the_axes_are_skewed() -> None:
-    view = uneven()
-    view.K[0, 1] = 3.0
-    rays = viewing_rays(view, np.float64)
-    u, v = pixel_grid(view, np.float64)
-    at = (rays * 1e6) @ view.K.T
-    np.testing.assert_allclose(at[..., 0] / at[..., 2] - 0.5, np.broadcast_to(u, rays.shape[:2]), atol=1e-9)
-    np.testing.assert_allclose(at[..., 1] / at[..., 2] - 0.5, np.broadcast_to(v, rays.shape[:2]), atol=1e-9)
-    assert viewing_rays(view).dtype == np.float32
