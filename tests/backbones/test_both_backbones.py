@@ -33,9 +33,7 @@ from d2_plugin.gaussians import spherical_harmonics as sh
 from d2_plugin.protocol import Backbone, Points
 
 COUNT = 20
-
 EDITS = ("insert", "remove", "grow", "prune", "reorder")
-
 edits = st.lists(st.tuples(st.sampled_from(EDITS), st.integers(0, 2**16)), max_size=10)
 
 

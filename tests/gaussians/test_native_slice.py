@@ -26,8 +26,6 @@ from d2_plugin.gaussians.rotation4d import (
 from d2_plugin.gaussians.slicing import reference_slice
 
 OUTPUTS = ("means", "covariances", "opacities")
-
-
 needs_compiler = pytest.mark.usefixtures("compiler")
 
 
@@ -169,7 +167,6 @@ def test_slice_agrees_with_the_reference_implementation(name: str) -> None:
 
 
 PATHS = {"kernel": native, "torch, float32": plain, "torch, float64": exact}
-
 IDENTITY = torch.tensor([1.0, 0, 0, 0])
 
 

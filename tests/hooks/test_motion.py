@@ -31,7 +31,6 @@ from d2_plugin.plugin import D2Hooks
 from d2_plugin.protocol import DepthPrior, Label, Points, View
 
 VIEWS = make_views()
-
 FIRST, SECOND = VIEWS[0], VIEWS[3]
 """One camera at two instants, half a second apart."""
 
@@ -200,7 +199,6 @@ def test_a_resumed_run_is_bitwise_the_uninterrupted_one_and_not_that_without_the
 
 
 INTERVAL = 0.1
-
 BAR = 2
 """Width of what moves, pixels."""
 

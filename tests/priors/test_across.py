@@ -18,7 +18,6 @@ from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.store.store import PriorStore
 
 cv2 = pytest.importorskip("cv2")
-
 ALIGN = AlignSettings()
 SIDE = 16
 """Of the one patch that stereo knows, pixels."""

@@ -189,7 +189,6 @@ def leverage() -> tuple[np.ndarray, np.ndarray]:
 
 
 NORMAL, UNIFORM = np.random.default_rng(0).normal(size=500), np.random.default_rng(1).uniform(1, 6, 500)
-
 FROM_1E_3_TO_1E6 = 10 ** np.random.default_rng(0).uniform(-3, 6, 500)
 
 

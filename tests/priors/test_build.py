@@ -35,9 +35,7 @@ from d2_plugin.store.store import PriorStore
 
 pytest.importorskip("cv2")
 
-
 NAMES = ["train0", "train1", "train2"]
-
 SETTINGS = PriorSettings(stereo=StereoSettings(matcher="patchmatch"))
 
 
@@ -310,7 +308,6 @@ def test_mistakes_are_told_before_anything_is_written(plain, tmp_path, names, ch
 
 
 REUSE = PriorSettings(stereo=StereoSettings(matcher="patchmatch", reuse_block=3))
-
 STILL_NAMES = ["train0", "train1"]
 
 

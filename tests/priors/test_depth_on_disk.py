@@ -26,12 +26,8 @@ from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.store.store import PriorStore
 
 cv2 = pytest.importorskip("cv2")
-
-
 NAMES = ["train0", "train1", "train2"]
-
 AUTO = StereoSettings()
-
 SENSOR = StereoSettings(matcher="sensor")
 
 

@@ -24,7 +24,6 @@ from d2_plugin.recordings.synthetic.room import synthetic_recording
 
 pytest.importorskip("cv2")
 
-
 SETTINGS = StereoSettings()
 
 

@@ -26,7 +26,6 @@ pytest.importorskip("cv2")
 
 # Pixels: both agree, both disagree, only geometric, only monocular, neither.
 MONO = np.array([[2.1, 3.0, 0.0, 5.0, 0.0]], np.float32)
-
 GEOMETRIC = np.array([[2.0, 2.0, 4.0, 0.0, 0.0]], np.float32)
 
 

@@ -20,8 +20,6 @@ from d2_plugin.recordings.synthetic.room import synthetic_recording
 
 pytest.importorskip("cv2")
 pytestmark = pytest.mark.usefixtures("compiler")
-
-
 SETTINGS = StereoSettings(matcher="patchmatch")
 
 

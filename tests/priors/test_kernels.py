@@ -28,10 +28,8 @@ from d2_plugin.store.maps import FusedPrior
 
 pytest.importorskip("cv2")
 pytestmark = pytest.mark.usefixtures("compiler")
-
 SETTINGS = StereoSettings()
 TOLERANCE = 0.02
-
 Rig = tuple[list[np.ndarray], list[Camera], list[np.ndarray]]
 """Grey images, cameras, depth maps."""
 Maps = dict[str, np.ndarray]

@@ -22,10 +22,7 @@ from d2_plugin.recordings.recording import Camera
 
 pytest.importorskip("cv2")
 pytestmark = pytest.mark.usefixtures("compiler")
-
 SETTINGS = StereoSettings()
-
-
 Maps = list[tuple[np.ndarray, np.ndarray]]
 """Depth and cost of each view."""
 

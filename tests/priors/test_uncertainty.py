@@ -19,8 +19,6 @@ from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.store.maps import FusedPrior
 
 cv2 = pytest.importorskip("cv2")
-
-
 SETTINGS = AlignSettings()
 
 
@@ -162,7 +160,6 @@ def test_too_few_anchors_declare_nothing_however_large_the_image(scenes: list[Sc
 
 
 ROWS = np.arange(135)[:, None]
-
 WIDE = np.geomspace(1e-3, 1e6, 135 * 240).reshape(135, 240)
 
 STIFF: dict[str, Callable[[Scene], tuple[np.ndarray, np.ndarray]]] = {
@@ -241,7 +238,6 @@ def test_a_map_that_misses_some_things_is_less_sure_everywhere_and_vetoes_less(s
 
 
 FAR = 12.0
-
 KINDS: tuple[MonoKind, ...] = ("relative", "metric")
 
 

@@ -32,7 +32,6 @@ from d2_plugin.protocol import Label
 from d2_plugin.rasterizer import RasterSettings, Render, Splats, cuda, native, rasterize, reference, survey
 
 pytestmark = pytest.mark.usefixtures("compiler")
-
 NAMES = ("means", "covariances", "opacities", "colors", "background", "screen_offsets")
 REFERENCE = Path(torch.float64)
 

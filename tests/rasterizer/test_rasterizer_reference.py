@@ -14,7 +14,6 @@ from d2_plugin.protocol import Label
 from d2_plugin.rasterizer import DepthPrior, RasterSettings, Splats, rasterize, reference, survey
 
 SETTINGS, SMOOTH = RasterSettings(), RasterSettings(antialiased=True)
-
 TRUSTED = (Label.VERIFIED, Label.AGREED)
 
 

@@ -10,7 +10,6 @@ import pytest
 
 TESTS = Path(__file__).resolve().parents[1]
 SANITIZED = "-O1 -g -fsanitize=address -fno-omit-frame-pointer"
-
 pytestmark = pytest.mark.slow
 
 

@@ -215,7 +215,6 @@ def test_case_36_an_empty_scene_is_filled_within_the_budget_from_depths_that_are
 
 
 TAU_V = 0.5
-
 both = pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["float32", "float64"])
 
 
