@@ -4,20 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from tiny import (
-    ALL_HOOKS,
-    BACKBONES,
-    DISTANCE,
-    HEIGHT,
-    WIDTH,
-    TinyFrames,
-    TinyStore,
-    make_adapter,
-    make_model,
-    make_views,
-    parameters,
-    same,
-)
+from tiny import ALL_HOOKS, BACKBONES, TinyFrames, TinyStore, make_adapter, make_model, make_views, parameters, same
 from torch import Tensor
 
 from d2_plugin.backbones.model import SplatModel
@@ -33,6 +20,7 @@ from d2_plugin.protocol import DepthPrior, Label, Points, View
 VIEWS = make_views()
 FIRST, SECOND = VIEWS[0], VIEWS[3]
 """One camera at two instants, half a second apart."""
+HEIGHT, WIDTH = FIRST.height, FIRST.width
 
 
 class Halfway(TinyStore):
@@ -217,7 +205,7 @@ class Crossing:
 
     def prior(self, camera: str, frame: int) -> DepthPrior:
         labels = torch.full((HEIGHT, WIDTH), int(Label.VERIFIED), dtype=torch.uint8)
-        return DepthPrior(torch.full((HEIGHT, WIDTH), DISTANCE), labels, self.image(frame) if self.colors else None)
+        return DepthPrior(torch.full((HEIGHT, WIDTH), 3.0), labels, self.image(frame) if self.colors else None)
 
     def image(self, frame: int) -> Tensor:
         grey = 100 + (self.flicker if frame % 2 else 0)

@@ -6,19 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 from test_motion import model_far_away
-from tiny import (
-    DISTANCE,
-    HEIGHT,
-    WIDTH,
-    TinyFrames,
-    TinyStore,
-    make_adapter,
-    make_model,
-    make_trainer,
-    make_views,
-    parameters,
-    same,
-)
+from tiny import WIDTH, TinyFrames, TinyStore, make_adapter, make_model, make_trainer, make_views, parameters, same
 from torch import Tensor
 
 from d2_plugin.backbones.model import SplatModel
@@ -95,7 +83,7 @@ def test_a_plane_that_both_know_is_seen_where_it_lies_from_there() -> None:
     columns, rows = pixels % WIDTH, pixels // WIDTH
     # Of the 16 columns that the left camera knows, the right one sees those from the eighth on, eight further left.
     assert columns.unique().tolist() == list(range(2 * STEP, KNOWN))
-    assert rows.unique().tolist() == list(range(HEIGHT))
+    assert rows.unique().tolist() == list(range(LEFT.height))
     torch.testing.assert_close(places, torch.stack([columns + 0.5 - STEP, rows + 0.5]), atol=1e-4, rtol=0)
 
 
@@ -107,15 +95,15 @@ def test_mono_only_pixels_are_not_taken_for_known() -> None:
 
 def test_what_either_camera_knows_to_stand_before_it_hides_it() -> None:
     own, other = prior_of(LEFT), prior_of(RIGHT)
-    own.depth[0, 15] = DISTANCE / 2  # moves by eight pixels from camera to camera: column 7 of the middle view
+    own.depth[0, 15] /= 2  # moves by eight pixels from camera to camera: column 7 of the middle view
     assert seen_columns(own, other) == [8, 9, 13, 14]
-    other.depth[0, 0] = DISTANCE / 2  # before the plane's column 8, and in column 8 of the middle view, before its 12
+    other.depth[0, 0] /= 2  # before the plane's column 8, and in column 8 of the middle view, before its 12
     assert seen_columns(prior_of(LEFT), other) == [9, 10, 14, 15]
 
 
 def test_what_moves_may_hide_whatever_lies_behind_its_rays() -> None:
     """A person before the wall whose depth neither camera knows: he covers columns 8 to 11 from the middle."""
-    moving = [torch.zeros(HEIGHT, WIDTH, dtype=torch.bool) for _ in range(2)]
+    moving = [torch.zeros(LEFT.height, WIDTH, dtype=torch.bool) for _ in range(2)]
     away = round(30 * 0.4 / 1.5)  # pixels that he moves by from camera to camera, at half the distance of the wall
     moving[0][:, 8 + away : 12 + away], moving[1][:, 8 - away : 12 - away] = True, True
     sides = [Side(view, prior_of(view), moved) for view, moved in zip((LEFT, RIGHT), moving)]
@@ -165,7 +153,7 @@ def test_views_in_float64_are_as_good() -> None:
 def test_from_the_same_place_all_that_both_know_is_seen() -> None:
     twin = replace(LEFT, camera="twin")
     pixels, _ = in_sight(on_the_way(LEFT, twin, 0.5), Side(LEFT, prior_of(LEFT)), Side(twin, prior_of(LEFT)))
-    assert len(pixels) == HEIGHT * KNOWN
+    assert len(pixels) == LEFT.height * KNOWN
 
 
 def test_where_nothing_is_drawn_before_an_unknown_background_nothing_is_lost() -> None:

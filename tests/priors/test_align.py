@@ -9,14 +9,7 @@ from scipy.optimize import minimize
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.monocular import align as module
 from d2_plugin.priors.monocular.affine import AffineFit, charbonnier, fit_affine
-from d2_plugin.priors.monocular.align import (
-    Alignment,
-    AlignStatus,
-    align,
-    aligned_depth,
-    not_aligned,
-    rank_correlation,
-)
+from d2_plugin.priors.monocular.align import Alignment, AlignStatus, align, aligned_depth, not_aligned, rank_correlation
 from d2_plugin.priors.settings import AlignSettings
 
 SHAPE = (90, 120)

@@ -9,14 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from refusals import refuses
 
-from d2_plugin.priors.fuse import (
-    VARIANTS,
-    cross_source_discrepancy,
-    fuse,
-    hanging_pixels,
-    verified_region,
-    with_matches,
-)
+from d2_plugin.priors.fuse import VARIANTS, cross_source_discrepancy, fuse, hanging_pixels, with_matches
 from d2_plugin.priors.monocular.align import Alignment, AlignStatus, aligned_inverse
 from d2_plugin.priors.monocular.far import far_pixels
 from d2_plugin.protocol import Label
@@ -36,7 +29,9 @@ def test_the_discrepancy_is_relative_to_geometric_depth() -> None:
 
 
 def test_verified_is_strictly_below_tau_c() -> None:
-    np.testing.assert_array_equal(verified_region(np.array([0.0, 0.099, 0.1, np.inf]), 0.1), [True, True, False, False])
+    mono, geometric = np.float32([[2.0, 2.49, 2.5]]), np.full((1, 3), 2.0, np.float32)
+    labels = fuse(mono, geometric, tau_c=0.25).labels
+    np.testing.assert_array_equal(labels, [[Label.VERIFIED, Label.VERIFIED, Label.CONFLICT]])
 
 
 def test_fusion_takes_geometric_depth_where_verified_and_monocular_where_it_is_alone() -> None:
