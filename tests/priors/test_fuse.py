@@ -4,12 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from hypothesis.extra.numpy import arrays
 from refusals import refuses
 
-from d2_plugin.priors.fuse import VARIANTS, cross_source_discrepancy, fuse, hanging_pixels, with_matches
+from d2_plugin.priors.fuse import cross_source_discrepancy, fuse, hanging_pixels, with_matches
 from d2_plugin.priors.monocular.align import Alignment, AlignStatus, aligned_inverse
 from d2_plugin.priors.monocular.far import far_pixels
 from d2_plugin.protocol import Label
@@ -87,18 +84,6 @@ def test_each_row_of_the_ablation_is_a_variant(variant: str, depth: list, labels
     prior = fuse(MONO, GEOMETRIC, tau_c=0.1, variant=variant)
     np.testing.assert_allclose(prior.depth, depth)
     np.testing.assert_array_equal(prior.labels, labels)
-
-
-depths = arrays(np.float32, (4, 5), elements=st.one_of(st.just(0.0), st.floats(0.125, 1000, width=32)))
-
-
-@given(depths, depths, st.floats(0.01, 0.5), st.sampled_from(VARIANTS))
-def test_exactly_supported_pixels_have_a_depth_and_it_is_one_of_the_two(mono, geometric, tau_c, variant) -> None:
-    prior = fuse(mono, geometric, tau_c=tau_c, variant=variant)
-    supported = np.isin(prior.labels, (Label.VERIFIED, Label.MONO))
-    np.testing.assert_array_equal(supported, prior.depth > 0)
-    assert np.all((prior.depth == 0) | (prior.depth == mono) | (prior.depth == geometric))
-    assert sum(prior.shares().values()) == pytest.approx(1)
 
 
 def test_the_blur_of_a_depth_edge_proposes_nothing_but_still_verifies() -> None:
