@@ -61,11 +61,6 @@ def loss_of(adapter: object, store: object | None = None, step: int = 2, **chang
     return Motion(MotionConfig(**changes)).loss(context)
 
 
-def shown(adapter: object, time: float) -> Tensor:
-    """What the backbone renders of the first camera, with its background."""
-    return adapter.model.render(replace(FIRST, time=time)).color.detach()
-
-
 def test_what_is_looked_at_between_two_instants_is_what_moves_and_a_rim() -> None:
     view, kept = PriorLoader(Halfway()).underway(FIRST, [FIRST, SECOND])
     prior = kept.prior(torch.device("cpu"))
@@ -95,7 +90,8 @@ class TestLoss:
     def test_of_the_render_itself_at_that_time_it_is_next_to_nothing(self, backbone: str) -> None:
         adapter = make_adapter(make_model(backbone=backbone))
         for step, time in ((1, 0.125), (2, 0.25), (3, 0.375), (4, 0.25)):
-            image = (255 * shown(adapter, time)).round().clamp(0, 255).byte()
+            shown = adapter.model.render(replace(FIRST, time=time)).color.detach()  # with its background
+            image = (255 * shown).round().clamp(0, 255).byte()
             assert float(loss_of(adapter, Halfway(image), step).detach()) < 1e-3
 
     def test_it_moves_gaussians_and_has_the_weight_that_was_asked_for(self, backbone: str) -> None:

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -229,16 +230,12 @@ def test_what_is_in_sight_follows_from_the_instants_that_are_known_and_not_from_
     assert not torch.equal(first, later)
 
 
-class Nothing(TinyStore):
-    """A store that knows nothing of the right camera."""
-
-    def prior(self, camera: str, frame: int) -> DepthPrior | None:
-        return None if camera == RIGHT.camera else super().prior(camera, frame)
+LEFT_ALONE = SimpleNamespace(prior=lambda camera, *frame: prior_of(LEFT) if camera == LEFT.camera else None)
 
 
 @pytest.mark.parametrize(
     ("views", "store"),
-    [([LEFT], None), ([], None), ([LEFT, make_views()[5]], None), ([LEFT, RIGHT], Nothing())],
+    [([LEFT], None), ([], None), ([LEFT, make_views()[5]], None), ([LEFT, RIGHT], LEFT_ALONE)],
     ids=["one camera", "cameras that move", "another instant", "no prior beside"],
 )
 def test_there_is_no_loss_where_nothing_is_known(views: list[View], store: object | None) -> None:

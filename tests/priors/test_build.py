@@ -232,16 +232,6 @@ def test_one_camera_has_no_depth_from_a_relative_map(plain: Recording, tmp_path:
     assert "one camera" in str(summary)
 
 
-def test_one_camera_has_mono_only_depth_from_a_metric_map(plain: Recording, tmp_path: Path) -> None:
-    metric = showing(plain, {"mono": plain.depth}, mono_kind="metric")
-    build_priors(metric, NAMES[:1], tmp_path, SETTINGS)
-    prior = PriorStore.open(tmp_path).prior("train0", 0)
-    assert set(np.unique(prior.labels)) <= {Label.MONO, Label.EMPTY}
-    alone = prior.support.numpy()
-    assert alone.mean() > 0.8
-    np.testing.assert_allclose(prior.depth.numpy()[alone], plain.depth("train0", 0)[alone], rtol=1e-4)
-
-
 def test_no_source_at_all_is_an_error(plain: Recording, tmp_path: Path) -> None:
     refuses("has no depth source", build_priors, replace(plain, mono_kind=None), NAMES[:1], tmp_path / "p", SETTINGS)
     assert not (tmp_path / "p").exists()

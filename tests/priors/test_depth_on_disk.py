@@ -403,11 +403,17 @@ def test_distances_along_the_ray_become_planar_depth_once(one_sensor: Recording)
     np.testing.assert_allclose(prior_of(one_sensor).prior(ONE, 0).depth, before, rtol=1e-3)
 
 
-def test_metric_maps_may_measure_along_the_ray_and_relative_ones_may_not(tmp_path: Path) -> None:
+@pytest.mark.parametrize("along", ["ray", "z"])
+def test_metric_maps_of_one_camera_are_its_prior_and_may_measure_along_the_ray(tmp_path: Path, along: str) -> None:
     room = synthetic_recording(cameras=1, held_out=0, frames=1, width=96, height=54)
-    distance = along_the_ray(room).astype(np.float32)
-    metric = showing(room, {"mono": lambda *_: distance}, path=tmp_path, mono_kind="metric")
-    found = prior_of(metric, PriorSettings(mono_along="ray", hanging_limit=0)).prior(ONE, 0).depth
-    np.testing.assert_allclose(found, room.depth(ONE, 0), rtol=1e-3)
+    truth = room.depth(ONE, 0)
+    mono = along_the_ray(room).astype(np.float32) if along == "ray" else truth
+    metric = showing(room, {"mono": lambda *_: mono}, path=tmp_path, mono_kind="metric")
+    found = prior_of(metric, PriorSettings(mono_along=along, hanging_limit=0)).prior(ONE, 0)
+    np.testing.assert_allclose(found.depth, truth, rtol=1e-3)
+    assert (found.labels == Label.MONO).all()
+
+
+def test_relative_maps_may_not_measure_along_the_ray(one_sensor: Recording) -> None:
     with pytest.raises(D2Error, match="mono_along = ray needs metric maps"):
-        prior_of(replace(metric, mono_kind="relative"), PriorSettings(mono_along="ray"))
+        prior_of(replace(one_sensor, mono_kind="relative"), PriorSettings(mono_along="ray"))

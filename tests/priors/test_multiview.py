@@ -82,10 +82,6 @@ def median_error(room: Recording, store: PriorStore, *labels: Label) -> float:
     return float(np.median(np.concatenate(errors)))
 
 
-def with_poses(poses: np.ndarray) -> list[Camera]:
-    return [Camera(str(i), 8, 6, np.eye(3), np.vstack([pose, [0, 0, 0, 1]])) for i, pose in enumerate(poses)]
-
-
 def test_files_are_read_as_the_exporters_name_their_arrays(room: Recording, tmp_path: Path) -> None:
     """Also where their scripts put them, below a folder of the instant; what a file holds besides is passed over."""
     arrays = emulated_multiview([room.depth(name, 0) for name in NAMES], list(room.cameras.values()), 0, posed=False)
@@ -159,7 +155,8 @@ def test_poses_have_the_scale_of_the_similarity_also_for_two_cameras_and_on_a_li
     moved = (centres - place) @ turn / scale
     poses = np.concatenate([theirs, -theirs @ moved[..., None]], axis=2)
     calibrated = np.concatenate([rotations, -rotations @ centres[..., None]], axis=2)
-    assert pose_scale(poses, with_poses(calibrated)) == pytest.approx(scale, rel=1e-6)
+    cameras = [Camera("", 8, 6, np.eye(3), np.vstack([pose, [0, 0, 0, 1]])) for pose in calibrated]
+    assert pose_scale(poses, cameras) == pytest.approx(scale, rel=1e-6)
 
 
 def test_maps_tell_their_scale_without_poses_and_overrule_wrong_ones(room: Recording) -> None:

@@ -8,6 +8,7 @@ from functools import partial
 import numpy as np
 import pytest
 from prior_cases import camera_at
+from refusals import refuses
 
 from benchmarks.stereo_measure import measure
 from benchmarks.stereo_rigs import Rig, load_rigs, textured_rig
@@ -203,7 +204,6 @@ def test_a_processor_without_wide_vectors_finds_the_same(rig: Rig, native: Maps,
 
 def test_a_mistake_is_one_sentence(rig: Rig) -> None:
     floats = [image / 255 for image in grays(rig)]
-    with pytest.raises(D2Error, match=r"uint8 \[H, W\], got float64"):
-        patchmatch(floats, rig.cameras, rig.depth_range)
+    refuses(r"uint8 \[H, W\], got float64", patchmatch, floats, rig.cameras, rig.depth_range)
     with pytest.raises(D2Error, match="patchmatch_sources must be at least 1 and at most 32, got 33"):
         raw(rig, replace(SETTINGS, patchmatch_sources=33))

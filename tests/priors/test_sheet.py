@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from refusals import refuses
 
-from d2_plugin.errors import D2Error
 from d2_plugin.priors.sheet import LABEL_COLORS, UNKNOWN, contact_sheet, depth_colors, sigma_colors
 from d2_plugin.protocol import Label
 from d2_plugin.recordings.synthetic.room import synthetic_recording
@@ -41,8 +41,7 @@ def test_the_sheet_shows_image_depth_and_labels_of_every_view(tmp_path: Path) ->
     shown = row[8:, 3 * 64 : 3 * 64 + 32].astype(int)
     np.testing.assert_allclose(shown, np.broadcast_to(expected, shown.shape), atol=3)
     assert not row[8:, 3 * 64 + 32 :].any()
-    with pytest.raises(D2Error, match="no prior at frames 1"):
-        contact_sheet(store, recording, tmp_path / "none.png", frames=[1])
+    refuses("no prior at frames 1", contact_sheet, store, recording, tmp_path / "none.png", frames=[1])
 
 
 def test_near_is_red_far_is_blue_and_empty_is_black() -> None:
