@@ -8,7 +8,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from tiny import ALL_HOOKS, HEIGHT, WIDTH, TinyStore, make_adapter, make_model, make_trainer, make_views
+from tiny import HEIGHT, WIDTH, TinyStore, make_adapter, make_model, make_trainer, make_views
 from torch import Tensor
 
 from d2_plugin.config import D2Config, DensifyConfig, PruneConfig
@@ -201,25 +201,6 @@ def test_the_sums_are_those_of_the_two_kinds_of_evidence() -> None:
     found = gather(context(splats, views, prior).evaluation, 40, True)
     torch.testing.assert_close(found[0], error, rtol=1e-6, atol=1e-9)
     torch.testing.assert_close(found[1], total, rtol=1e-6, atol=1e-9)
-
-
-def test_far_pixels_alone_reach_the_hook_through_the_plugin() -> None:
-    """A prior of sky alone removes translucent Gaussians before it, through D2Hooks and a real backbone."""
-    everywhere = torch.full((HEIGHT, WIDTH), int(Label.FAR), dtype=torch.uint8)
-    sky = DepthPrior(torch.full((HEIGHT, WIDTH), 50.0), everywhere, sigma=torch.full((HEIGHT, WIDTH), torch.inf))
-    config = replace(
-        ALL_HOOKS, densify=None, depth_loss=None, prune=PruneConfig(start=1, every=1, patience=1, light=1, sight=False)
-    )
-    left = {}
-    for free_space in (True, False):
-        model = make_model()
-        store = SimpleNamespace(prior=lambda camera, frame: sky)
-        chosen = replace(config, prune=replace(config.prune, free_space=free_space))
-        d2 = D2Hooks(chosen, make_adapter(model), store)
-        d2.loss(1, make_views())
-        d2.step(1)
-        left[free_space] = len(model)
-    assert left[True] < left[False] == 60
 
 
 @pytest.mark.parametrize("sight", [True, False])
