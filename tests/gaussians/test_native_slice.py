@@ -47,12 +47,7 @@ class Sliced(NamedTuple):
 
 
 def sliced(
-    slice_in: Callable,
-    dtype: torch.dtype,
-    rows: Mapping[str, Tensor],
-    at: float = AT,
-    weighed: bool = True,
-    used: slice = slice(None),
+    slice_in: Callable, dtype: torch.dtype, rows: Mapping[str, Tensor], at=AT, weighed=True, used=slice(None)
 ) -> Sliced:
     """The slice by `slice_in`, and gradients of the sum of the outputs `used`, `weighed` by a fixed noise or not."""
     raw = {name: value.to(dtype, copy=True).requires_grad_() for name, value in rows.items()}

@@ -19,12 +19,11 @@ from d2_plugin.recordings.recording import Camera
 from d2_plugin.store.maps import FusedPrior
 from oracles.stereo_filter import interpolated_surface
 
+Cameras = Mapping[str, Camera]
+
 
 def with_evidence(
-    priors: Mapping[str, FusedPrior],
-    cameras: Mapping[str, Camera],
-    tolerance: float,
-    tails: Mapping[str, float] | None = None,
+    priors: Mapping[str, FusedPrior], cameras: Cameras, tolerance: float, tails: Mapping[str, float] | None = None
 ) -> dict[str, FusedPrior]:
     """As `evidence.with_evidence`."""
     views = {name: view_of(prior) for name, prior in priors.items()}
@@ -47,12 +46,7 @@ class Points(NamedTuple):
 
 
 def _informed(
-    name: str,
-    prior: FusedPrior,
-    views: Mapping[str, View],
-    cameras: Mapping[str, Camera],
-    tolerance: float,
-    agreeing: float,
+    name: str, prior: FusedPrior, views: Mapping[str, View], cameras: Cameras, tolerance: float, agreeing: float
 ) -> FusedPrior:
     """The prior of one view with what the others say; `agreeing` is the factor of sigma where a map agrees."""
     rows, columns = np.nonzero(prior.labels == Label.MONO)

@@ -40,10 +40,7 @@ def patch(depth: np.ndarray, seed: int) -> np.ndarray:
 
 
 def shown(
-    room: Recording,
-    kind: MonoKind = "relative",
-    turned: Callable[[str, np.ndarray], np.ndarray] | None = None,
-    unit: float = 1.0,
+    room: Recording, kind: MonoKind = "relative", turned: Callable | None = None, unit: float = 1.0
 ) -> dict[str, Shown]:
     """Each camera with a map that is exact but for its line (or `turned`), and one patch of depth, in `unit`s."""
     views = {}
