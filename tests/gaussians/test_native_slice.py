@@ -26,7 +26,6 @@ from d2_plugin.gaussians.rotation4d import (
 from d2_plugin.gaussians.slicing import reference_slice
 
 OUTPUTS = ("means", "covariances", "opacities")
-needs_compiler = pytest.mark.usefixtures("compiler")
 
 
 @pytest.fixture(params=[True, False], ids=["temporal", "static"])
@@ -66,80 +65,69 @@ plain = partial(sliced, reference_slice, torch.float32)
 exact = partial(sliced, reference_slice, torch.float64)
 
 
-@needs_compiler
-@pytest.mark.parametrize("time_scale", [0.02, 2.0])
-@pytest.mark.parametrize("count", [0, 1, 15, 16, 17, 3001])
-def test_values_and_gradients_are_those_of_torch_in_float64(count: int, time_scale: float, temporal: bool) -> None:
-    rows = random_rows(count, temporal, count, time_scale)
-    found, expected = native(rows), exact(rows)
-    assert torch.equal(found.rows, expected.rows)
-    for value, other in zip(found[:3], expected):
-        assert value.is_contiguous()
-        assert relative_error(value, other) < 2e-6
-    for name, other in expected.gradients.items():
-        assert relative_error(found.gradients[name], other) < 1e-5, name
+@pytest.mark.usefixtures("compiler")
+class TestKernel:
+    @pytest.mark.parametrize("time_scale", [0.02, 2.0])
+    @pytest.mark.parametrize("count", [0, 1, 15, 16, 17, 3001])
+    def test_values_and_gradients_are_those_of_torch_in_float64(self, count, time_scale, temporal) -> None:
+        rows = random_rows(count, temporal, count, time_scale)
+        found, expected = native(rows), exact(rows)
+        assert torch.equal(found.rows, expected.rows)
+        for value, other in zip(found[:3], expected):
+            assert value.is_contiguous()
+            assert relative_error(value, other) < 2e-6
+        for name, other in expected.gradients.items():
+            assert relative_error(found.gradients[name], other) < 1e-5, name
 
+    def test_where_float32_is_short_of_digits_the_kernel_loses_no_more_than_torch(self) -> None:
+        rows = random_rows(300, True, time_scale=200.0)  # velocities are ratios of numbers three orders apart
+        found, other, expected = native(rows), plain(rows), exact(rows)
+        assert torch.equal(found.rows, expected.rows)
+        for ours, theirs, right in zip(found[:3], other, expected):
+            assert relative_error(ours, right) < 2e-6 + 1.5 * relative_error(theirs, right)
+        for name, right in expected.gradients.items():
+            allowed = 2e-6 + 1.5 * relative_error(other.gradients[name], right)
+            assert relative_error(found.gradients[name], right) < allowed, name
 
-@needs_compiler
-def test_where_float32_is_short_of_digits_the_kernel_loses_no_more_than_torch() -> None:
-    rows = random_rows(300, True, time_scale=200.0)  # velocities are ratios of numbers three orders apart
-    found, other, expected = native(rows), plain(rows), exact(rows)
-    assert torch.equal(found.rows, expected.rows)
-    for ours, theirs, right in zip(found[:3], other, expected):
-        assert relative_error(ours, right) < 2e-6 + 1.5 * relative_error(theirs, right)
-    for name, right in expected.gradients.items():
-        allowed = 2e-6 + 1.5 * relative_error(other.gradients[name], right)
-        assert relative_error(found.gradients[name], right) < allowed, name
+    def test_the_number_of_threads_changes_no_bit(self, temporal: bool, same_for_any_threads: Callable) -> None:
+        def everything() -> list[Tensor]:
+            found = native(random_rows(10_000, temporal))
+            return [*found[:4], *found.gradients.values()]
 
+        same_for_any_threads(everything)
 
-@needs_compiler
-def test_the_number_of_threads_changes_no_bit(temporal: bool, same_for_any_threads: Callable) -> None:
-    def everything() -> list[Tensor]:
-        found = native(random_rows(10_000, temporal))
-        return [*found[:4], *found.gradients.values()]
+    @pytest.mark.parametrize("spoilt", list(TEMPORAL))
+    @pytest.mark.parametrize("value", [math.nan, math.inf])
+    def test_nan_or_infinity_in_one_gaussian_leaves_the_others_untouched(self, spoilt: str, value: float) -> None:
+        rows = random_rows(200, True, time_scale=20.0)
+        clean = native(rows)
+        rows[spoilt].view(200, -1)[7, 0] = value
+        found = native(rows)
+        for output, expected in zip(found[:3], clean):
+            assert torch.equal(output[found.rows != 7], expected[clean.rows != 7])
+        others = torch.arange(200) != 7
+        for name, expected in clean.gradients.items():
+            assert torch.equal(found.gradients[name][others], expected[others]), name
 
-    same_for_any_threads(everything)
+    @pytest.mark.parametrize("used", range(3), ids=OUTPUTS)
+    def test_each_output_alone_has_its_gradient(self, temporal: bool, used: int) -> None:
+        rows, alone = random_rows(40, temporal), slice(used, used + 1)
+        found, expected = native(rows, used=alone), exact(rows, used=alone)
+        for name, gradient in expected.gradients.items():
+            assert relative_error(found.gradients[name], gradient) < 5e-6, name
 
+    def test_rows_of_another_number_of_gaussians_are_refused(self) -> None:
+        rows = random_rows(10, True)
+        rows["right"] = rows["right"][:9]
+        with pytest.raises(D2Error, match=r"right has shape \(9, 4\), expected 4 numbers for each of 10 Gaussians"):
+            native_slice(rows, AT, *CONSTANTS)
 
-@needs_compiler
-@pytest.mark.parametrize("spoilt", list(TEMPORAL))
-@pytest.mark.parametrize("value", [math.nan, math.inf])
-def test_nan_or_infinity_in_one_gaussian_leaves_the_others_untouched(spoilt: str, value: float) -> None:
-    rows = random_rows(200, True, time_scale=20.0)
-    clean = native(rows)
-    rows[spoilt].view(200, -1)[7, 0] = value
-    found = native(rows)
-    for output, expected in zip(found[:3], clean):
-        assert torch.equal(output[found.rows != 7], expected[clean.rows != 7])
-    others = torch.arange(200) != 7
-    for name, expected in clean.gradients.items():
-        assert torch.equal(found.gradients[name][others], expected[others]), name
-
-
-@needs_compiler
-@pytest.mark.parametrize("used", range(3), ids=OUTPUTS)
-def test_each_output_alone_has_its_gradient(temporal: bool, used: int) -> None:
-    rows, alone = random_rows(40, temporal), slice(used, used + 1)
-    found, expected = native(rows, used=alone), exact(rows, used=alone)
-    for name, gradient in expected.gradients.items():
-        assert relative_error(found.gradients[name], gradient) < 5e-6, name
-
-
-@needs_compiler
-def test_rows_of_another_number_of_gaussians_are_refused() -> None:
-    rows = random_rows(10, True)
-    rows["right"] = rows["right"][:9]
-    with pytest.raises(D2Error, match=r"right has shape \(9, 4\), expected 4 numbers for each of 10 Gaussians"):
-        native_slice(rows, AT, *CONSTANTS)
-
-
-@needs_compiler
-def test_a_model_slices_in_torch_where_there_is_no_compiler(temporal: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    model, view = make_model(temporal=temporal), make_views()[-1]
-    compiled = model.slice_at(view)
-    monkeypatch.setattr(kernel, "library", lambda: None)
-    for one, other in zip(model.slice_at(view), compiled):
-        torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-6)
+    def test_a_model_slices_in_torch_where_there_is_no_compiler(self, temporal, monkeypatch) -> None:
+        model, view = make_model(temporal=temporal), make_views()[-1]
+        compiled = model.slice_at(view)
+        monkeypatch.setattr(kernel, "library", lambda: None)
+        for one, other in zip(model.slice_at(view), compiled):
+            torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-6)
 
 
 def tensor(*values: float) -> torch.Tensor:

@@ -12,19 +12,10 @@ from tiny import HEIGHT, WIDTH, TinyStore, make_adapter, make_model, make_traine
 from torch import Tensor
 
 from d2_plugin.config import D2Config, DensifyConfig, PruneConfig
+from d2_plugin.hooks import prune as module
 from d2_plugin.hooks.hook import FREE_SIGMAS, Context
 from d2_plugin.hooks.prior import PriorLoader
-from d2_plugin.hooks.prune import (
-    Prune,
-    Sums,
-    depth_inconsistency,
-    faint,
-    floating,
-    gather,
-    opacity_contribution,
-    pruning_score,
-    within_light,
-)
+from d2_plugin.hooks.prune import Prune, Sums, depth_inconsistency, gather, opacity_contribution, within_light
 from d2_plugin.hooks.views import ViewSampler
 from d2_plugin.plugin import D2Hooks
 from d2_plugin.protocol import DepthPrior, Edit, Label, RasterSettings, Splats, View
@@ -89,7 +80,7 @@ def test_the_scores_are_the_papers(seed: int, with_sigma: bool) -> None:
     inconsistency = torch.where(total > 0, (error / (total + 1e-8) / 0.1).clamp(max=1), 0)
     contribution = torch.where(seen > 0, maxima / seen.clamp(min=1), 0)
     score = 0.5 * inconsistency + 0.5 * (1 - contribution)
-    torch.testing.assert_close(pruning_score(inconsistency, contribution, 0.5), score, rtol=0, atol=0)
+    torch.testing.assert_close(module.pruning_score(inconsistency, contribution, 0.5), score, rtol=0, atol=0)
     if with_sigma:
         prior = prior._replace(sigma=torch.where(prior.verified, 0.0, torch.inf))
     config = replace(EVERY_ONE, free_space=not with_sigma)  # without sigma no space is known to be free
@@ -181,7 +172,7 @@ def test_what_is_too_small_to_see_is_no_floater() -> None:
 
     def first_floats(others: float) -> bool:
         error, weight, front = torch.tensor([[1.0, 0], [1.0, others], [0.6, 0]])
-        return bool(floating(Sums(error, weight, *torch.ones(3, 2), front))[0])
+        return bool(module.floating(Sums(error, weight, *torch.ones(3, 2), front))[0])
 
     assert not first_floats(1e5)
     assert first_floats(1e4)
@@ -237,7 +228,7 @@ def test_in_the_last_evaluation_whose_fringe_alone_is_in_an_image_goes_too(step:
 def test_what_no_view_shows_by_a_twentieth_of_a_pixel_is_faint_and_what_none_shows_is_not_judged() -> None:
     largest = torch.tensor([0.0, 1e-6, 0.049, 0.051, 0.9])
     sums = Sums(*torch.ones(4, 5), largest, torch.zeros(5))
-    assert faint(sums).tolist() == [False, True, True, False, False]
+    assert module.faint(sums).tolist() == [False, True, True, False, False]
     here = scattered(0)
     found = context(here, make_views()[:3], TinyStore().prior("", 0))
     shown = torch.stack([survey.max_weight for _, _, _, survey in found.evaluation])
