@@ -14,15 +14,8 @@ from torch import Tensor
 
 from d2_plugin import D2Error
 from d2_plugin.gaussians import native_slice as kernel
+from d2_plugin.gaussians import rotation4d
 from d2_plugin.gaussians.native_slice import TEMPORAL, native_slice
-from d2_plugin.gaussians.rotation4d import (
-    condition_on_time,
-    covariances_from_factors,
-    normalized_quaternions,
-    rotation_matrices_4d,
-    temporal_marginal,
-    time_row,
-)
 from d2_plugin.gaussians.slicing import reference_slice
 
 OUTPUTS = ("means", "covariances", "opacities")
@@ -137,14 +130,14 @@ def tensor(*values: float) -> torch.Tensor:
 @pytest.mark.parametrize("name", GOLDEN)
 def test_slice_agrees_with_the_reference_implementation(name: str) -> None:
     mean, mean_time, scales, left, right, instant, at, covariance, marginal, variance, velocity = GOLDEN[name]
-    left, right = normalized_quaternions(tensor(*left)[:, None]), normalized_quaternions(tensor(*right)[:, None])
-    factors = rotation_matrices_4d(left, right) * tensor(*scales)[:, None]
-    spatial, speed = condition_on_time(factors)
-    v_t = (time_row(left, right) * tensor(*scales)[:, None]).square().sum(0)
+    left, right = (rotation4d.normalized_quaternions(tensor(*side)[:, None]) for side in (left, right))
+    factors = rotation4d.rotation_matrices_4d(left, right) * tensor(*scales)[:, None]
+    spatial, speed = rotation4d.condition_on_time(factors)
+    v_t = (rotation4d.time_row(left, right) * tensor(*scales)[:, None]).square().sum(0)
     np.testing.assert_allclose(v_t[0], variance, rtol=1e-12)
     np.testing.assert_allclose(tensor(*mean) + speed[:, 0] * (instant - mean_time), tensor(*at), atol=5e-9)
-    np.testing.assert_allclose(covariances_from_factors(spatial)[0], tensor(*covariance), atol=5e-9)
-    np.testing.assert_allclose(temporal_marginal(tensor(instant - mean_time), v_t)[0], marginal, rtol=1e-12)
+    np.testing.assert_allclose(rotation4d.covariances_from_factors(spatial)[0], tensor(*covariance), atol=5e-9)
+    np.testing.assert_allclose(rotation4d.temporal_marginal(tensor(instant - mean_time), v_t)[0], marginal, rtol=1e-12)
     if velocity is not None:
         np.testing.assert_allclose(speed[:, 0], tensor(*velocity), atol=5e-9)
 
@@ -210,7 +203,7 @@ def test_the_norm_of_a_quaternion_changes_nothing_but_its_gradient(take_slice, t
 
 @pytest.mark.parametrize("norm", [0.0, 1e-4, 1.0, 6e4])
 def test_quaternions_in_half_precision_have_length_one(norm: float) -> None:
-    unit = normalized_quaternions(torch.tensor([[0.6], [0.0], [0.8], [0.0]]).mul(norm).half())
+    unit = rotation4d.normalized_quaternions(torch.tensor([[0.6], [0.0], [0.8], [0.0]]).mul(norm).half())
     torch.testing.assert_close(unit.norm(dim=0), torch.ones(1, dtype=torch.float16), atol=2e-3, rtol=0)
 
 
