@@ -130,17 +130,19 @@ def test_a_resumed_run_is_bitwise_the_uninterrupted_one(backbone: str, config: D
 
 
 def test_a_run_comes_to_rest_at_its_end(backbone: str) -> None:
-    """All learning rates are a twentieth in the end, positions' also a hundredth; none rises past the last step."""
+    """All learning rates are a twentieth in the end, positions' also a hundredth; none rises past the last step. A
+    short run learns to its last steps."""
     model = make_model(COUNT, backbone=backbone)
 
-    def rates(step: int) -> dict[str, float]:
-        model.optimize(step, 2000)
+    def rates(step: int, iterations: int = 2000) -> dict[str, float]:
+        model.optimize(step, iterations)
         return {group["name"]: group["lr"] for group in model.gaussians.optimizer.param_groups}
 
     first, late, end = rates(0), rates(1400), rates(2000)
     assert late == {**first, "positions": pytest.approx(first["positions"] * 0.01**0.7)}
     assert end == pytest.approx({**{n: rate / 20 for n, rate in first.items()}, "positions": first["positions"] / 2000})
     assert rates(2600) == end
+    assert {**rates(98, 100), "positions": first["positions"]} == first
 
 
 def test_what_hardly_shows_is_left_out_at_the_end_of_a_run(backbone: str) -> None:

@@ -15,6 +15,7 @@ from benchmarks.stereo_rigs import Rig, load_rigs, textured_rig
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.geometry import index_intrinsics, pixel_grid, scaled_camera
 from d2_plugin.priors.settings import StereoSettings
+from d2_plugin.priors.stereo import patchmatch as module
 from d2_plugin.priors.stereo.geometric_depth import gray
 from d2_plugin.priors.stereo.patchmatch import OFFERED, handed_over, patchmatch
 from d2_plugin.priors.stereo.pyramid import NO_MATCH, LevelView
@@ -78,6 +79,12 @@ def test_a_depth_range_ten_times_too_wide_does_no_harm(rig: Rig) -> None:
     assert wide["completeness"] > narrow["completeness"] - 0.02
     assert wide["wrong"] < narrow["wrong"] + 0.01
     assert wide["median"] < 1.1 * narrow["median"]
+
+
+def test_what_one_view_found_helps_the_others(rig: Rig, native: Maps, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "_exchange", lambda *arguments: None)
+    alone = raw(rig)
+    assert share_within(native, rig, 0.01) > share_within(alone, rig, 0.01) + 0.01
 
 
 def seen_plane(camera: Camera, normal: np.ndarray, offset: float, cost: float) -> LevelView:
