@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor
 
@@ -121,7 +119,3 @@ def parameters(trainer: Trainer) -> dict[str, Tensor]:
 
 def same(a: dict[str, Tensor], b: dict[str, Tensor]) -> bool:
     return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
-
-
-def is_finite(trainer: Trainer) -> bool:
-    return all(math.isfinite(value.abs().max()) for value in parameters(trainer).values())

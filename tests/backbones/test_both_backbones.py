@@ -3,39 +3,25 @@
 import io
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tiny import (
-    ALL_HOOKS,
-    BACKBONES,
-    TinyFrames,
-    TinyStore,
-    bend_field,
-    is_finite,
-    make_adapter,
-    make_model,
-    make_trainer,
-    make_views,
-    parameters,
-    same,
-)
+from tiny import ALL_HOOKS, BACKBONES, bend_field, make_adapter, make_model, make_trainer, make_views, parameters, same
 
 from d2_plugin import D2Config, D2Error, D2Hooks
 from d2_plugin.backbones.densify import DensifySettings, grow, prune
-from d2_plugin.backbones.model import SplatModel, settled
+from d2_plugin.backbones.model import SplatModel
 from d2_plugin.backbones.starting import nearest_neighbour_scales
 from d2_plugin.backbones.yang4d import create
 from d2_plugin.gaussians import spherical_harmonics as sh
 from d2_plugin.protocol import Backbone, Points
 
 COUNT = 20
-
 EDITS = ("insert", "remove", "grow", "prune", "reorder")
-
 edits = st.lists(st.tuples(st.sampled_from(EDITS), st.integers(0, 2**16)), max_size=10)
 
 
@@ -98,7 +84,7 @@ def test_every_per_gaussian_state_stays_on_its_row(name: str, sequence: list[tup
     """Numbers follow the reports; parameters, Adam moments, statistics and pruning streaks must have followed too."""
     model = numbered(name)
     adapter = make_adapter(model)
-    d2 = D2Hooks(ALL_HOOKS, adapter, TinyStore())
+    d2 = D2Hooks(ALL_HOOKS, adapter, SimpleNamespace(prior=lambda camera, frame: None))
     d2.hooks["prune"].streak = torch.arange(1, COUNT + 1)
     numbers = [torch.arange(1.0, COUNT + 1)]
     adapter.on_resize(lambda index: numbers.append(torch.cat([numbers[-1], torch.zeros(1)])[index]))  # -1: the zero
@@ -140,30 +126,23 @@ def test_a_resumed_run_is_bitwise_the_uninterrupted_one(backbone: str, config: D
     second.load_state_dict(torch.load(buffer, weights_only=True))
     second.run()
     assert same(parameters(whole), parameters(second))
-    assert is_finite(whole)
     assert whole.model.appearance.change("cam0").abs().max() > 0
 
 
 def test_a_run_comes_to_rest_at_its_end(backbone: str) -> None:
-    """All learning rates are a twentieth in the end, positions' also a hundredth; none rises past the last step."""
+    """All learning rates are a twentieth in the end, positions' also a hundredth; none rises past the last step. A
+    short run learns to its last steps."""
     model = make_model(COUNT, backbone=backbone)
 
-    def rates(step: int) -> dict[str, float]:
-        model.optimize(step, 2000)
+    def rates(step: int, iterations: int = 2000) -> dict[str, float]:
+        model.optimize(step, iterations)
         return {group["name"]: group["lr"] for group in model.gaussians.optimizer.param_groups}
 
     first, late, end = rates(0), rates(1400), rates(2000)
     assert late == {**first, "positions": pytest.approx(first["positions"] * 0.01**0.7)}
     assert end == pytest.approx({**{n: rate / 20 for n, rate in first.items()}, "positions": first["positions"] / 2000})
     assert rates(2600) == end
-
-
-@pytest.mark.parametrize("iterations", [0, 1, 10, 100, 1000, 30_000])
-def test_a_short_run_learns_to_its_last_steps(iterations: int) -> None:
-    shares = [settled(step, iterations) for step in range(iterations + 1)]
-    assert shares == sorted(shares, reverse=True)
-    assert shares[-1] == 0.05
-    assert shares.count(1.0) == pytest.approx(iterations - 0.3 * iterations * min(iterations / 2000, 1), abs=1.01)
+    assert {**rates(98, 100), "positions": first["positions"]} == first
 
 
 def test_what_hardly_shows_is_left_out_at_the_end_of_a_run(backbone: str) -> None:
@@ -206,7 +185,6 @@ def test_training_lowers_the_loss_of_the_tiny_scene(backbone: str) -> None:
     trainer = make_trainer(iterations=100, backbone=backbone)
     trainer.run(on_step=lambda step, loss: losses.append(loss))
     assert sum(losses[-6:]) < 0.5 * sum(losses[:6])
-    assert is_finite(trainer)
 
 
 def test_without_time_these_are_ordinary_3d_gaussians(backbone: str) -> None:
@@ -297,11 +275,10 @@ class TestDensityControl:
 
 
 def test_every_training_view_is_used_once_per_round() -> None:
-    drawn, trainer = [], make_trainer()
+    drawn, trainer, views = [], make_trainer(), make_views()
     trainer.model.accumulate = drawn.append
-    count = len(TinyFrames().views)
-    trainer.run(until=count)
-    assert {(view.camera, view.frame) for view in drawn} == {(view.camera, view.frame) for view in TinyFrames().views}
+    trainer.run(until=len(views))
+    assert {(view.camera, view.frame) for view in drawn} == {(view.camera, view.frame) for view in views}
 
 
 @pytest.mark.parametrize("degree", [0, 1])
@@ -323,5 +300,5 @@ def test_black_is_no_trap(backbone: str, degree: int) -> None:
 def test_colours_of_direction_and_time_train_and_grow() -> None:
     trainer = make_trainer(iterations=20, sh_degree=1, sh_time_degree=2)
     trainer.run()
-    assert is_finite(trainer)
+    assert all(value.isfinite().all() for value in parameters(trainer).values())
     assert len(trainer.model) > 60

@@ -14,21 +14,11 @@ from torch import Tensor
 
 from d2_plugin import D2Error
 from d2_plugin.gaussians import native_slice as kernel
+from d2_plugin.gaussians import rotation4d
 from d2_plugin.gaussians.native_slice import TEMPORAL, native_slice
-from d2_plugin.gaussians.rotation4d import (
-    condition_on_time,
-    covariances_from_factors,
-    normalized_quaternions,
-    rotation_matrices_4d,
-    temporal_marginal,
-    time_row,
-)
 from d2_plugin.gaussians.slicing import reference_slice
 
 OUTPUTS = ("means", "covariances", "opacities")
-
-
-needs_compiler = pytest.mark.usefixtures("compiler")
 
 
 @pytest.fixture(params=[True, False], ids=["temporal", "static"])
@@ -49,12 +39,7 @@ class Sliced(NamedTuple):
 
 
 def sliced(
-    slice_in: Callable,
-    dtype: torch.dtype,
-    rows: Mapping[str, Tensor],
-    at: float = AT,
-    weighed: bool = True,
-    used: slice = slice(None),
+    slice_in: Callable, dtype: torch.dtype, rows: Mapping[str, Tensor], at=AT, weighed=True, used=slice(None)
 ) -> Sliced:
     """The slice by `slice_in`, and gradients of the sum of the outputs `used`, `weighed` by a fixed noise or not."""
     raw = {name: value.to(dtype, copy=True).requires_grad_() for name, value in rows.items()}
@@ -73,80 +58,69 @@ plain = partial(sliced, reference_slice, torch.float32)
 exact = partial(sliced, reference_slice, torch.float64)
 
 
-@needs_compiler
-@pytest.mark.parametrize("time_scale", [0.02, 2.0])
-@pytest.mark.parametrize("count", [0, 1, 15, 16, 17, 3001])
-def test_values_and_gradients_are_those_of_torch_in_float64(count: int, time_scale: float, temporal: bool) -> None:
-    rows = random_rows(count, temporal, count, time_scale)
-    found, expected = native(rows), exact(rows)
-    assert torch.equal(found.rows, expected.rows)
-    for value, other in zip(found[:3], expected):
-        assert value.is_contiguous()
-        assert relative_error(value, other) < 2e-6
-    for name, other in expected.gradients.items():
-        assert relative_error(found.gradients[name], other) < 1e-5, name
+@pytest.mark.usefixtures("compiler")
+class TestKernel:
+    @pytest.mark.parametrize("time_scale", [0.02, 2.0])
+    @pytest.mark.parametrize("count", [0, 1, 15, 16, 17, 3001])
+    def test_values_and_gradients_are_those_of_torch_in_float64(self, count, time_scale, temporal) -> None:
+        rows = random_rows(count, temporal, count, time_scale)
+        found, expected = native(rows), exact(rows)
+        assert torch.equal(found.rows, expected.rows)
+        for value, other in zip(found[:3], expected):
+            assert value.is_contiguous()
+            assert relative_error(value, other) < 2e-6
+        for name, other in expected.gradients.items():
+            assert relative_error(found.gradients[name], other) < 1e-5, name
 
+    def test_where_float32_is_short_of_digits_the_kernel_loses_no_more_than_torch(self) -> None:
+        rows = random_rows(300, True, time_scale=200.0)  # velocities are ratios of numbers three orders apart
+        found, other, expected = native(rows), plain(rows), exact(rows)
+        assert torch.equal(found.rows, expected.rows)
+        for ours, theirs, right in zip(found[:3], other, expected):
+            assert relative_error(ours, right) < 2e-6 + 1.5 * relative_error(theirs, right)
+        for name, right in expected.gradients.items():
+            allowed = 2e-6 + 1.5 * relative_error(other.gradients[name], right)
+            assert relative_error(found.gradients[name], right) < allowed, name
 
-@needs_compiler
-def test_where_float32_is_short_of_digits_the_kernel_loses_no_more_than_torch() -> None:
-    rows = random_rows(300, True, time_scale=200.0)  # velocities are ratios of numbers three orders apart
-    found, other, expected = native(rows), plain(rows), exact(rows)
-    assert torch.equal(found.rows, expected.rows)
-    for ours, theirs, right in zip(found[:3], other, expected):
-        assert relative_error(ours, right) < 2e-6 + 1.5 * relative_error(theirs, right)
-    for name, right in expected.gradients.items():
-        allowed = 2e-6 + 1.5 * relative_error(other.gradients[name], right)
-        assert relative_error(found.gradients[name], right) < allowed, name
+    def test_the_number_of_threads_changes_no_bit(self, temporal: bool, same_for_any_threads: Callable) -> None:
+        def everything() -> list[Tensor]:
+            found = native(random_rows(10_000, temporal))
+            return [*found[:4], *found.gradients.values()]
 
+        same_for_any_threads(everything)
 
-@needs_compiler
-def test_the_number_of_threads_changes_no_bit(temporal: bool, same_for_any_threads: Callable) -> None:
-    def everything() -> list[Tensor]:
-        found = native(random_rows(10_000, temporal))
-        return [*found[:4], *found.gradients.values()]
+    @pytest.mark.parametrize("spoilt", list(TEMPORAL))
+    @pytest.mark.parametrize("value", [math.nan, math.inf])
+    def test_nan_or_infinity_in_one_gaussian_leaves_the_others_untouched(self, spoilt: str, value: float) -> None:
+        rows = random_rows(200, True, time_scale=20.0)
+        clean = native(rows)
+        rows[spoilt].view(200, -1)[7, 0] = value
+        found = native(rows)
+        for output, expected in zip(found[:3], clean):
+            assert torch.equal(output[found.rows != 7], expected[clean.rows != 7])
+        others = torch.arange(200) != 7
+        for name, expected in clean.gradients.items():
+            assert torch.equal(found.gradients[name][others], expected[others]), name
 
-    same_for_any_threads(everything)
+    @pytest.mark.parametrize("used", range(3), ids=OUTPUTS)
+    def test_each_output_alone_has_its_gradient(self, temporal: bool, used: int) -> None:
+        rows, alone = random_rows(40, temporal), slice(used, used + 1)
+        found, expected = native(rows, used=alone), exact(rows, used=alone)
+        for name, gradient in expected.gradients.items():
+            assert relative_error(found.gradients[name], gradient) < 5e-6, name
 
+    def test_rows_of_another_number_of_gaussians_are_refused(self) -> None:
+        rows = random_rows(10, True)
+        rows["right"] = rows["right"][:9]
+        with pytest.raises(D2Error, match=r"right has shape \(9, 4\), expected 4 numbers for each of 10 Gaussians"):
+            native_slice(rows, AT, *CONSTANTS)
 
-@needs_compiler
-@pytest.mark.parametrize("spoilt", list(TEMPORAL))
-@pytest.mark.parametrize("value", [math.nan, math.inf])
-def test_nan_or_infinity_in_one_gaussian_leaves_the_others_untouched(spoilt: str, value: float) -> None:
-    rows = random_rows(200, True, time_scale=20.0)
-    clean = native(rows)
-    rows[spoilt].view(200, -1)[7, 0] = value
-    found = native(rows)
-    for output, expected in zip(found[:3], clean):
-        assert torch.equal(output[found.rows != 7], expected[clean.rows != 7])
-    others = torch.arange(200) != 7
-    for name, expected in clean.gradients.items():
-        assert torch.equal(found.gradients[name][others], expected[others]), name
-
-
-@needs_compiler
-@pytest.mark.parametrize("used", range(3), ids=OUTPUTS)
-def test_each_output_alone_has_its_gradient(temporal: bool, used: int) -> None:
-    rows, alone = random_rows(40, temporal), slice(used, used + 1)
-    found, expected = native(rows, used=alone), exact(rows, used=alone)
-    for name, gradient in expected.gradients.items():
-        assert relative_error(found.gradients[name], gradient) < 5e-6, name
-
-
-@needs_compiler
-def test_rows_of_another_number_of_gaussians_are_refused() -> None:
-    rows = random_rows(10, True)
-    rows["right"] = rows["right"][:9]
-    with pytest.raises(D2Error, match=r"right has shape \(9, 4\), expected 4 numbers for each of 10 Gaussians"):
-        native_slice(rows, AT, *CONSTANTS)
-
-
-@needs_compiler
-def test_a_model_slices_in_torch_where_there_is_no_compiler(temporal: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    model, view = make_model(temporal=temporal), make_views()[-1]
-    compiled = model.slice_at(view)
-    monkeypatch.setattr(kernel, "library", lambda: None)
-    for one, other in zip(model.slice_at(view), compiled):
-        torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-6)
+    def test_a_model_slices_in_torch_where_there_is_no_compiler(self, temporal, monkeypatch) -> None:
+        model, view = make_model(temporal=temporal), make_views()[-1]
+        compiled = model.slice_at(view)
+        monkeypatch.setattr(kernel, "library", lambda: None)
+        for one, other in zip(model.slice_at(view), compiled):
+            torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-6)
 
 
 def tensor(*values: float) -> torch.Tensor:
@@ -156,20 +130,19 @@ def tensor(*values: float) -> torch.Tensor:
 @pytest.mark.parametrize("name", GOLDEN)
 def test_slice_agrees_with_the_reference_implementation(name: str) -> None:
     mean, mean_time, scales, left, right, instant, at, covariance, marginal, variance, velocity = GOLDEN[name]
-    left, right = normalized_quaternions(tensor(*left)[:, None]), normalized_quaternions(tensor(*right)[:, None])
-    factors = rotation_matrices_4d(left, right) * tensor(*scales)[:, None]
-    spatial, speed = condition_on_time(factors)
-    v_t = (time_row(left, right) * tensor(*scales)[:, None]).square().sum(0)
+    left, right = (rotation4d.normalized_quaternions(tensor(*side)[:, None]) for side in (left, right))
+    factors = rotation4d.rotation_matrices_4d(left, right) * tensor(*scales)[:, None]
+    spatial, speed = rotation4d.condition_on_time(factors)
+    v_t = (rotation4d.time_row(left, right) * tensor(*scales)[:, None]).square().sum(0)
     np.testing.assert_allclose(v_t[0], variance, rtol=1e-12)
     np.testing.assert_allclose(tensor(*mean) + speed[:, 0] * (instant - mean_time), tensor(*at), atol=5e-9)
-    np.testing.assert_allclose(covariances_from_factors(spatial)[0], tensor(*covariance), atol=5e-9)
-    np.testing.assert_allclose(temporal_marginal(tensor(instant - mean_time), v_t)[0], marginal, rtol=1e-12)
+    np.testing.assert_allclose(rotation4d.covariances_from_factors(spatial)[0], tensor(*covariance), atol=5e-9)
+    np.testing.assert_allclose(rotation4d.temporal_marginal(tensor(instant - mean_time), v_t)[0], marginal, rtol=1e-12)
     if velocity is not None:
         np.testing.assert_allclose(speed[:, 0], tensor(*velocity), atol=5e-9)
 
 
 PATHS = {"kernel": native, "torch, float32": plain, "torch, float64": exact}
-
 IDENTITY = torch.tensor([1.0, 0, 0, 0])
 
 
@@ -230,7 +203,7 @@ def test_the_norm_of_a_quaternion_changes_nothing_but_its_gradient(take_slice, t
 
 @pytest.mark.parametrize("norm", [0.0, 1e-4, 1.0, 6e4])
 def test_quaternions_in_half_precision_have_length_one(norm: float) -> None:
-    unit = normalized_quaternions(torch.tensor([[0.6], [0.0], [0.8], [0.0]]).mul(norm).half())
+    unit = rotation4d.normalized_quaternions(torch.tensor([[0.6], [0.0], [0.8], [0.0]]).mul(norm).half())
     torch.testing.assert_close(unit.norm(dim=0), torch.ones(1, dtype=torch.float16), atol=2e-3, rtol=0)
 
 

@@ -19,7 +19,6 @@ from d2_plugin.hooks.prior import FAR, JUDGES, KnownMaps, PriorLoader
 from d2_plugin.protocol import DepthPrior, Label, View
 
 PAPER = DepthLossConfig(tau_v=0.5, epsilon=0.01, sigma_full=0.05, opaque=0)
-
 LABELS = (Label.EMPTY, Label.MONO, Label.VERIFIED, Label.CONFLICT, Label.AGREED, Label.FAR)
 
 

@@ -4,36 +4,23 @@ from dataclasses import replace
 
 import pytest
 import torch
-from tiny import (
-    ALL_HOOKS,
-    BACKBONES,
-    DISTANCE,
-    HEIGHT,
-    WIDTH,
-    TinyFrames,
-    TinyStore,
-    make_adapter,
-    make_model,
-    make_views,
-    parameters,
-    same,
-)
+from tiny import ALL_HOOKS, BACKBONES, TinyFrames, TinyStore, make_adapter, make_model, make_views, parameters, same
 from torch import Tensor
 
 from d2_plugin.backbones.model import SplatModel
 from d2_plugin.backbones.trainer import Trainer, TrainSettings
-from d2_plugin.config import D2Config, DensifyConfig, MotionConfig
+from d2_plugin.config import D2Config, DensifyConfig, MotionConfig, ParallaxConfig
 from d2_plugin.hooks.densify import CHANGED, Densify, MovingPixels
-from d2_plugin.hooks.hook import Context
+from d2_plugin.hooks.hook import Context, HookConfig
 from d2_plugin.hooks.motion import Motion
 from d2_plugin.hooks.prior import RIM, PriorLoader
 from d2_plugin.plugin import D2Hooks
 from d2_plugin.protocol import DepthPrior, Label, Points, View
 
 VIEWS = make_views()
-
 FIRST, SECOND = VIEWS[0], VIEWS[3]
 """One camera at two instants, half a second apart."""
+HEIGHT, WIDTH = FIRST.height, FIRST.width
 
 
 class Halfway(TinyStore):
@@ -74,11 +61,6 @@ def loss_of(adapter: object, store: object | None = None, step: int = 2, **chang
     return Motion(MotionConfig(**changes)).loss(context)
 
 
-def shown(adapter: object, time: float) -> Tensor:
-    """What the backbone renders of the first camera, with its background."""
-    return adapter.model.render(replace(FIRST, time=time)).color.detach()
-
-
 def test_what_is_looked_at_between_two_instants_is_what_moves_and_a_rim() -> None:
     view, kept = PriorLoader(Halfway()).underway(FIRST, [FIRST, SECOND])
     prior = kept.prior(torch.device("cpu"))
@@ -108,7 +90,8 @@ class TestLoss:
     def test_of_the_render_itself_at_that_time_it_is_next_to_nothing(self, backbone: str) -> None:
         adapter = make_adapter(make_model(backbone=backbone))
         for step, time in ((1, 0.125), (2, 0.25), (3, 0.375), (4, 0.25)):
-            image = (255 * shown(adapter, time)).round().clamp(0, 255).byte()
+            shown = adapter.model.render(replace(FIRST, time=time)).color.detach()  # with its background
+            image = (255 * shown).round().clamp(0, 255).byte()
             assert float(loss_of(adapter, Halfway(image), step).detach()) < 1e-3
 
     def test_it_moves_gaussians_and_has_the_weight_that_was_asked_for(self, backbone: str) -> None:
@@ -154,13 +137,6 @@ class TestWhereThereIsNothingToLearnFrom:
         for views, known in (([SECOND], [FIRST, SECOND]), ([FIRST], [FIRST])):
             assert Motion(MotionConfig()).loss(context_of(adapter, Halfway(), views, known)) is None
 
-    def test_nor_does_a_backbone_without_colours_which_is_logged_once(self, caplog: pytest.LogCaptureFixture) -> None:
-        adapter = make_adapter(make_model())
-        adapter.colors = None
-        hook, context = Motion(MotionConfig()), context_of(adapter, Halfway(), [FIRST], [FIRST, SECOND])
-        assert [hook.loss(context), hook.loss(context)] == [None, None]
-        assert len([r for r in caplog.records if "colors" in r.message]) == 1
-
 
 class TestInsertionHalfway:
     def points(self, insert: bool) -> Tensor:
@@ -187,15 +163,16 @@ class TestInsertionHalfway:
         assert not (self.points(False)[:, 0] == 0.25).any()
 
 
-def trainer(motion: MotionConfig | None) -> Trainer:
+def trainer(**more: HookConfig) -> Trainer:
     def attach(model: object) -> D2Hooks:
-        return D2Hooks(replace(ALL_HOOKS, motion=motion), make_adapter(model), Halfway())
+        return D2Hooks(replace(ALL_HOOKS, **more), make_adapter(model), Halfway())
 
     return Trainer(make_model(), TinyFrames(), TrainSettings(iterations=18, seed=3), attach)
 
 
-def test_a_resumed_run_is_bitwise_the_uninterrupted_one_and_not_that_without_the_hook() -> None:
-    whole, first, second, without = (trainer(MotionConfig() if i < 3 else None) for i in range(4))
+@pytest.mark.parametrize("hook", [{"motion": MotionConfig()}, {"parallax": ParallaxConfig(every=1)}])
+def test_a_resumed_run_is_bitwise_the_uninterrupted_one_and_not_that_without_the_hook(hook: dict) -> None:
+    whole, first, second, without = (trainer(**(hook if i < 3 else {})) for i in range(4))
     whole.run()
     first.run(9)
     second.load_state_dict(first.state_dict())
@@ -206,7 +183,6 @@ def test_a_resumed_run_is_bitwise_the_uninterrupted_one_and_not_that_without_the
 
 
 INTERVAL = 0.1
-
 BAR = 2
 """Width of what moves, pixels."""
 
@@ -225,7 +201,7 @@ class Crossing:
 
     def prior(self, camera: str, frame: int) -> DepthPrior:
         labels = torch.full((HEIGHT, WIDTH), int(Label.VERIFIED), dtype=torch.uint8)
-        return DepthPrior(torch.full((HEIGHT, WIDTH), DISTANCE), labels, self.image(frame) if self.colors else None)
+        return DepthPrior(torch.full((HEIGHT, WIDTH), 3.0), labels, self.image(frame) if self.colors else None)
 
     def image(self, frame: int) -> Tensor:
         grey = 100 + (self.flicker if frame % 2 else 0)

@@ -8,23 +8,14 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from tiny import ALL_HOOKS, HEIGHT, WIDTH, TinyStore, make_adapter, make_model, make_trainer, make_views
+from tiny import HEIGHT, WIDTH, TinyStore, make_adapter, make_model, make_trainer, make_views
 from torch import Tensor
 
 from d2_plugin.config import D2Config, DensifyConfig, PruneConfig
+from d2_plugin.hooks import prune as module
 from d2_plugin.hooks.hook import FREE_SIGMAS, Context
 from d2_plugin.hooks.prior import PriorLoader
-from d2_plugin.hooks.prune import (
-    Prune,
-    Sums,
-    depth_inconsistency,
-    faint,
-    floating,
-    gather,
-    opacity_contribution,
-    pruning_score,
-    within_light,
-)
+from d2_plugin.hooks.prune import Prune, Sums, depth_inconsistency, gather, opacity_contribution, within_light
 from d2_plugin.hooks.views import ViewSampler
 from d2_plugin.plugin import D2Hooks
 from d2_plugin.protocol import DepthPrior, Edit, Label, RasterSettings, Splats, View
@@ -38,21 +29,14 @@ class Fixed:
 
     settings = RasterSettings()
 
-    def __init__(self, splats: Splats) -> None:
-        self.splats = splats
+    def __init__(self, splats: Splats, not_now: int = 0) -> None:
+        self.splats, self.count = splats, len(splats.means) + not_now
 
     def __len__(self) -> int:
-        return len(self.splats.means)
+        return self.count
 
     def slice_at(self, view: View) -> Splats:
         return self.splats
-
-
-class OneMore(Fixed):
-    """The same with a Gaussian that does not live now."""
-
-    def __len__(self) -> int:
-        return len(self.splats.means) + 1
 
 
 def double(view: View) -> View:
@@ -79,10 +63,6 @@ def compositing_weights(splats: Splats, view: View) -> Tensor:
     return rasterize(splats, torch.eye(len(splats.means)).double(), view).color
 
 
-def papers_sigma(prior: DepthPrior) -> DepthPrior:
-    return prior._replace(sigma=torch.where(prior.verified, 0.0, torch.inf))
-
-
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("with_sigma", [False, True])
 def test_the_scores_are_the_papers(seed: int, with_sigma: bool) -> None:
@@ -100,8 +80,9 @@ def test_the_scores_are_the_papers(seed: int, with_sigma: bool) -> None:
     inconsistency = torch.where(total > 0, (error / (total + 1e-8) / 0.1).clamp(max=1), 0)
     contribution = torch.where(seen > 0, maxima / seen.clamp(min=1), 0)
     score = 0.5 * inconsistency + 0.5 * (1 - contribution)
-    torch.testing.assert_close(pruning_score(inconsistency, contribution, 0.5), score, rtol=0, atol=0)
-    prior = papers_sigma(prior) if with_sigma else prior
+    torch.testing.assert_close(module.pruning_score(inconsistency, contribution, 0.5), score, rtol=0, atol=0)
+    if with_sigma:
+        prior = prior._replace(sigma=torch.where(prior.verified, 0.0, torch.inf))
     config = replace(EVERY_ONE, free_space=not with_sigma)  # without sigma no space is known to be free
     found = context(splats, views, prior)
     sums = gather(found.evaluation, 40, config.free_space)
@@ -191,7 +172,7 @@ def test_what_is_too_small_to_see_is_no_floater() -> None:
 
     def first_floats(others: float) -> bool:
         error, weight, front = torch.tensor([[1.0, 0], [1.0, others], [0.6, 0]])
-        return bool(floating(Sums(error, weight, *torch.ones(3, 2), front))[0])
+        return bool(module.floating(Sums(error, weight, *torch.ones(3, 2), front))[0])
 
     assert not first_floats(1e5)
     assert first_floats(1e4)
@@ -213,25 +194,6 @@ def test_the_sums_are_those_of_the_two_kinds_of_evidence() -> None:
     torch.testing.assert_close(found[1], total, rtol=1e-6, atol=1e-9)
 
 
-def test_far_pixels_alone_reach_the_hook_through_the_plugin() -> None:
-    """A prior of sky alone removes translucent Gaussians before it, through D2Hooks and a real backbone."""
-    everywhere = torch.full((HEIGHT, WIDTH), int(Label.FAR), dtype=torch.uint8)
-    sky = DepthPrior(torch.full((HEIGHT, WIDTH), 50.0), everywhere, sigma=torch.full((HEIGHT, WIDTH), torch.inf))
-    config = replace(
-        ALL_HOOKS, densify=None, depth_loss=None, prune=PruneConfig(start=1, every=1, patience=1, light=1, sight=False)
-    )
-    left = {}
-    for free_space in (True, False):
-        model = make_model()
-        store = SimpleNamespace(prior=lambda camera, frame: sky)
-        chosen = replace(config, prune=replace(config.prune, free_space=free_space))
-        d2 = D2Hooks(chosen, make_adapter(model), store)
-        d2.loss(1, make_views())
-        d2.step(1)
-        left[free_space] = len(model)
-    assert left[True] < left[False] == 60
-
-
 @pytest.mark.parametrize("sight", [True, False])
 def test_whose_centre_no_camera_sees_goes_at_once_however_much_of_its_rim_shows(sight: bool) -> None:
     """The first is seen by the left camera alone, which is not evaluated; the second, third by none; nothing is known
@@ -242,7 +204,7 @@ def test_whose_centre_no_camera_sees_goes_at_once_however_much_of_its_rim_shows(
     known = ViewSampler()
     for view in views:
         known.add(view)
-    found = replace(context(here, views[2:3], wall), beside=known.beside, backbone=OneMore(here))
+    found = replace(context(here, views[2:3], wall), beside=known.beside, backbone=Fixed(here, not_now=1))
     edit = Prune(replace(EVERY_ONE, tau_p=1.0, sight=sight)).edit(found)
     assert (None if edit is None else edit.remove.tolist()) == ([False, True, True, False] if sight else None)
     pose = views[2].T_camera_world + torch.tensor([[0.0, 0, 0, 1], *3 * [[0] * 4]])
@@ -266,7 +228,7 @@ def test_in_the_last_evaluation_whose_fringe_alone_is_in_an_image_goes_too(step:
 def test_what_no_view_shows_by_a_twentieth_of_a_pixel_is_faint_and_what_none_shows_is_not_judged() -> None:
     largest = torch.tensor([0.0, 1e-6, 0.049, 0.051, 0.9])
     sums = Sums(*torch.ones(4, 5), largest, torch.zeros(5))
-    assert faint(sums).tolist() == [False, True, True, False, False]
+    assert module.faint(sums).tolist() == [False, True, True, False, False]
     here = scattered(0)
     found = context(here, make_views()[:3], TinyStore().prior("", 0))
     shown = torch.stack([survey.max_weight for _, _, _, survey in found.evaluation])

@@ -10,24 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from d2_plugin.priors.cross_view.kernel import (
-    BESIDE,
-    COMPARED,
-    DARK,
-    FEWEST,
-    FLATTEST,
-    LIKE,
-    LONGEST,
-    MET,
-    MISSED,
-    NEAR,
-    NUDGE,
-    ONE_PLACE,
-    OVERSHOT,
-    STEPS,
-    WITHIN,
-    View,
-)
+from d2_plugin.priors.cross_view import kernel
+from d2_plugin.priors.cross_view.kernel import View
 from d2_plugin.priors.evidence import AGREED, ALONE, AT_BEST, view_of
 from d2_plugin.priors.geometry import ViewPair, view_pair
 from d2_plugin.protocol import Label
@@ -35,12 +19,11 @@ from d2_plugin.recordings.recording import Camera
 from d2_plugin.store.maps import FusedPrior
 from oracles.stereo_filter import interpolated_surface
 
+Cameras = Mapping[str, Camera]
+
 
 def with_evidence(
-    priors: Mapping[str, FusedPrior],
-    cameras: Mapping[str, Camera],
-    tolerance: float,
-    tails: Mapping[str, float] | None = None,
+    priors: Mapping[str, FusedPrior], cameras: Cameras, tolerance: float, tails: Mapping[str, float] | None = None
 ) -> dict[str, FusedPrior]:
     """As `evidence.with_evidence`."""
     views = {name: view_of(prior) for name, prior in priors.items()}
@@ -63,12 +46,7 @@ class Points(NamedTuple):
 
 
 def _informed(
-    name: str,
-    prior: FusedPrior,
-    views: Mapping[str, View],
-    cameras: Mapping[str, Camera],
-    tolerance: float,
-    agreeing: float,
+    name: str, prior: FusedPrior, views: Mapping[str, View], cameras: Cameras, tolerance: float, agreeing: float
 ) -> FusedPrior:
     """The prior of one view with what the others say; `agreeing` is the factor of sigma where a map agrees."""
     rows, columns = np.nonzero(prior.labels == Label.MONO)
@@ -84,7 +62,7 @@ def _informed(
         gain = _gain(views[name], theirs, pair)
         asked = points if points.colors is None else points._replace(colors=points.colors * gain)
         at, apart = _apart(asked, pair, theirs, (Label.MONO, Label.AGREED))
-        followed = _apart(asked, pair, theirs, (Label.VERIFIED,))[1] < MISSED
+        followed = _apart(asked, pair, theirs, (Label.VERIFIED,))[1] < kernel.MISSED
         found, precision = _intersection(asked, pair, theirs, followed)
         seen |= np.isfinite(apart) | (found > 0)
         agreed |= (apart < tolerance) & _alike(asked, theirs, *at)
@@ -118,21 +96,21 @@ def _surface(view: View) -> np.ndarray:
 
 def _intersection(points: Points, pair: ViewPair, theirs: View, followed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Where followed rays meet the surface that another view verified: (depth [K], 0 where nowhere; sigma [K])."""
-    surface, allowed = _surface(theirs), np.minimum(WITHIN * points.sigma, NEAR)
+    surface, allowed = _surface(theirs), np.minimum(kernel.WITHIN * points.sigma, kernel.NEAR)
     miss, known = _miss(points, pair, surface, points.depth)
     step = _step(points, pair, surface, points.depth, miss)
-    followed = followed & known & (np.abs(step) < OVERSHOT * allowed)
+    followed = followed & known & (np.abs(step) < kernel.OVERSHOT * allowed)
     along = points.depth * np.exp(step)
-    for _ in range(STEPS - 1):
+    for _ in range(kernel.STEPS - 1):
         miss, known = _miss(points, pair, surface, along)
         along = along * np.exp(np.where(known, _step(points, pair, surface, along, miss), 0))
     miss, known = _miss(points, pair, surface, along)
     moved = np.abs(np.log(along / points.depth))
-    met = followed & known & (np.abs(miss) < MET) & (moved < allowed)
+    met = followed & known & (np.abs(miss) < kernel.MET) & (moved < allowed)
     at = pair.project(points.columns, points.rows, along)
     row, column = (np.rint(np.where(met, values, 0)).astype(np.int64) for values in (at.y, at.x))
     met &= _alike(points, theirs, row, column)
-    return np.where(met, along, 0), np.where(met, np.hypot(theirs.sigma[row, column], BESIDE * moved), np.inf)
+    return np.where(met, along, 0), np.where(met, np.hypot(theirs.sigma[row, column], kernel.BESIDE * moved), np.inf)
 
 
 def _alike(points: Points, theirs: View, row: np.ndarray, column: np.ndarray) -> np.ndarray:
@@ -140,31 +118,31 @@ def _alike(points: Points, theirs: View, row: np.ndarray, column: np.ndarray) ->
     if points.colors is None or theirs.colors is None:
         return np.ones(len(points.depth), bool)
     apart = np.abs(points.colors.astype(np.float32) - theirs.colors[row, column])
-    return (apart < LIKE * 255).all(axis=1)
+    return (apart < kernel.LIKE * 255).all(axis=1)
 
 
 def _gain(ours: View, theirs: View, pair: ViewPair) -> np.ndarray:
     """How much brighter the other camera shows what both verified, per channel [3]; 1 where that is too little."""
     surface = _surface(ours)
     known = np.flatnonzero(surface)
-    if ours.colors is None or theirs.colors is None or len(known) < FEWEST:
+    if ours.colors is None or theirs.colors is None or len(known) < kernel.FEWEST:
         return np.ones(3, np.float32)
-    rows, columns = np.divmod(known[:: max(len(known) // COMPARED, 1)], surface.shape[1])
+    rows, columns = np.divmod(known[:: max(len(known) // kernel.COMPARED, 1)], surface.shape[1])
     depth, mine = surface[rows, columns].astype(np.float64), ours.colors[rows, columns].astype(np.float32)
     at, apart = _apart(Points(columns, rows, depth, depth, mine), pair, theirs, (Label.VERIFIED,))
     seen = theirs.colors[at].astype(np.float32)
-    bright = (apart < ONE_PLACE) & (np.minimum(mine, seen) > DARK).all(axis=1)
-    if np.count_nonzero(bright) < FEWEST:
+    bright = (apart < kernel.ONE_PLACE) & (np.minimum(mine, seen) > kernel.DARK).all(axis=1)
+    if np.count_nonzero(bright) < kernel.FEWEST:
         return np.ones(3, np.float32)
     return np.median(seen[bright] / mine[bright], axis=0)
 
 
 def _step(points: Points, pair: ViewPair, surface: np.ndarray, depth: np.ndarray, miss: np.ndarray) -> np.ndarray:
     """Secant step in log depth [K] towards the surface, 0 where it is not known or runs along the ray."""
-    ahead, known = _miss(points, pair, surface, depth * NUDGE)
-    slope = (ahead - miss) / np.log(NUDGE)
-    usable = known & (np.abs(slope) > FLATTEST)
-    return np.clip(np.where(usable, -miss / np.where(usable, slope, 1), 0), -LONGEST, LONGEST)
+    ahead, known = _miss(points, pair, surface, depth * kernel.NUDGE)
+    slope = (ahead - miss) / np.log(kernel.NUDGE)
+    usable = known & (np.abs(slope) > kernel.FLATTEST)
+    return np.clip(np.where(usable, -miss / np.where(usable, slope, 1), 0), -kernel.LONGEST, kernel.LONGEST)
 
 
 def _miss(points: Points, pair: ViewPair, surface: np.ndarray, depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -7,21 +7,15 @@ import numpy as np
 
 from benchmarks.stereo_rigs import sample_nearest
 from d2_plugin.priors.geometry import CONTINUOUS, Projection, ViewPair, view_pair, viewing_rays
+from d2_plugin.priors.stereo.filtering import precision
 from d2_plugin.priors.stereo.filtering.confirm import NUDGE, REPROJECTION_MAX
-from d2_plugin.priors.stereo.filtering.precision import (
-    FLATTEST,
-    FLOOR,
-    GRAY_NOISE,
-    MATCHING,
-    OF_SCATTER,
-    OF_SPREAD,
-    PER_INCOHERENCE,
-)
 from d2_plugin.priors.stereo.settings import StereoSettings
 from d2_plugin.recordings.recording import Camera
 
+Map = np.ndarray
 
-def run(name: str, maps: dict[str, np.ndarray], **numbers: Any) -> None:
+
+def run(name: str, maps: dict[str, Map], **numbers: Any) -> None:
     """What `kernel.run` does, by the functions below."""
     if name == "slopes":
         maps["inverse"][:], maps["slope_x"][:], maps["slope_y"][:] = slopes(maps["depth"], numbers["reach"])
@@ -36,14 +30,8 @@ def run(name: str, maps: dict[str, np.ndarray], **numbers: Any) -> None:
 
 
 def coherence(
-    gray: np.ndarray,
-    inverse: np.ndarray,
-    slopes: tuple[np.ndarray, np.ndarray],
-    weights: np.ndarray,
-    radius: int,
-    stride: int,
-    relative: float,
-) -> np.ndarray:
+    gray: Map, inverse: Map, slopes: tuple[Map, Map], weights: Map, radius: int, stride: int, relative: float
+) -> Map:
     """What `kernel.run("coherence", ...)` writes, bit for bit; its arguments."""
     height, width = inverse.shape
     padded_inverse = np.pad(inverse, radius)
@@ -63,7 +51,7 @@ def coherence(
     return agreeing / np.maximum(total, np.finfo(np.float32).tiny)
 
 
-def slopes(depth: np.ndarray, reach: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def slopes(depth: Map, reach: int) -> tuple[Map, Map, Map]:
     """What `kernel.run("slopes", ...)` writes, bit for bit: (inverse depth, its slopes), per pixel.
 
     The flatter one-sided difference: at a depth edge one side runs over the edge and is the steeper one.
@@ -73,7 +61,7 @@ def slopes(depth: np.ndarray, reach: int) -> tuple[np.ndarray, np.ndarray, np.nd
     return inverse, np.ascontiguousarray(_vertical_slope(inverse.T, reach).T), _vertical_slope(inverse, reach)
 
 
-def _vertical_slope(inverse: np.ndarray, reach: int) -> np.ndarray:
+def _vertical_slope(inverse: Map, reach: int) -> Map:
     """Slope of inverse depth down the columns."""
     padded = np.pad(inverse, ((reach, reach), (0, 0)))
     above, below = padded[: -2 * reach], padded[2 * reach :]
@@ -84,13 +72,7 @@ def _vertical_slope(inverse: np.ndarray, reach: int) -> np.ndarray:
 
 
 def add_source(
-    sums: Any,
-    depth: np.ndarray,
-    theirs: np.ndarray,
-    reference: Camera,
-    source: Camera,
-    settings: StereoSettings,
-    tolerance: float,
+    sums: Any, depth: Map, theirs: Map, reference: Camera, source: Camera, settings: StereoSettings, tolerance: float
 ) -> None:
     """Add what one source says of `depth` [H, W] to the sums: the bits of the kernel."""
     v, u = np.indices(depth.shape, np.float32)
@@ -111,7 +93,7 @@ def add_source(
     sums.difference[:] += np.where(near, precision * (apart * apart), 0)
 
 
-def _meet(rays: np.ndarray, depth: np.ndarray, pair: ViewPair, settings: StereoSettings) -> np.ndarray:
+def _meet(rays: Map, depth: Map, pair: ViewPair, settings: StereoSettings) -> Map:
     """Whether the rays of both cameras meet at an angle that is allowed, [H, W].
 
     |a x b| and a.b are its sine and cosine times the same length. In units of the depth, so that no unit of the world
@@ -126,7 +108,7 @@ def _meet(rays: np.ndarray, depth: np.ndarray, pair: ViewPair, settings: StereoS
     return above & (sine * np.float32(np.cos(high)) < cosine * np.float32(np.sin(high)))
 
 
-def sample_surface(depth: np.ndarray, at: Projection) -> np.ndarray:
+def sample_surface(depth: Map, at: Projection) -> Map:
     """`depth` between the pixels around `at` where they are one surface, that of the nearest pixel elsewhere.
 
     On a ground that is seen at a grazing angle, depth changes by more than 1 % from one pixel to the next.
@@ -136,7 +118,7 @@ def sample_surface(depth: np.ndarray, at: Projection) -> np.ndarray:
     return np.where(known, between, sample_nearest(depth, at)).astype(np.float32)
 
 
-def interpolated_surface(depth: np.ndarray, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def interpolated_surface(depth: Map, x: Map, y: Map) -> tuple[Map, Map]:
     """A depth map [H, W] between its pixels: (where four neighbours are one surface, depth there), shaped like x and y.
 
     Bilinear in inverse depth, which is linear over a plane. x and y are array indices, NaN-free.
@@ -157,26 +139,21 @@ def interpolated_surface(depth: np.ndarray, x: np.ndarray, y: np.ndarray) -> tup
     return known, 1 / (upper * (1 - down) + lower * down)
 
 
-def sigma(
-    depth: np.ndarray,
-    coherence: np.ndarray,
-    gradient: np.ndarray,
-    parallax: np.ndarray,
-    spread: np.ndarray,
-    scatter: np.ndarray,
-) -> np.ndarray:
+def sigma(depth: Map, coherence: Map, gradient: Map, parallax: Map, spread: Map, scatter: Map) -> Map:
     """What `kernel.run("sigma", ...)` writes, bit for bit; its maps."""
     known = (depth > 0) & (parallax > 0) & np.isfinite(depth) & ~np.isnan(coherence)
     known &= np.isfinite(spread) & ~np.isnan(gradient)
     coherence, spread = (np.where(known, map_, 0) for map_ in (coherence, spread))
-    pixels = MATCHING + GRAY_NOISE / np.where(known, np.maximum(gradient, FLATTEST), 1)
-    pixels = pixels + PER_INCOHERENCE * (1 - np.clip(coherence, 0, 1))
+    pixels = precision.MATCHING + precision.GRAY_NOISE / np.where(known, np.maximum(gradient, precision.FLATTEST), 1)
+    pixels = pixels + precision.PER_INCOHERENCE * (1 - np.clip(coherence, 0, 1))
     matching = pixels / np.where(known, parallax, 1)
-    variance = matching**2 + (OF_SCATTER * scatter) ** 2 + (OF_SPREAD * spread) ** 2 + FLOOR**2
+    variance = (
+        matching**2 + (precision.OF_SCATTER * scatter) ** 2 + (precision.OF_SPREAD * spread) ** 2 + precision.FLOOR**2
+    )
     return np.where(known, np.sqrt(variance), np.inf).astype(np.float32)
 
 
-def scatter(depth: np.ndarray, reach: int, slack: float) -> np.ndarray:
+def scatter(depth: Map, reach: int, slack: float) -> Map:
     """What `kernel.run("scatter", ...)` writes, bit for bit; its arguments.
 
     Moments are about the window's own pixel: those about another one would differ by little from their products.
@@ -184,10 +161,10 @@ def scatter(depth: np.ndarray, reach: int, slack: float) -> np.ndarray:
     known = (depth > 0) & np.isfinite(depth)
     weight, inverse = known.astype(np.float64), np.where(known, 1 / np.where(known, depth, 1).astype(np.float64), 0)
 
-    def down(values: np.ndarray, power: int) -> np.ndarray:
+    def down(values: Map, power: int) -> Map:
         return _moment(values, reach, power)
 
-    def across(values: np.ndarray, power: int) -> np.ndarray:
+    def across(values: Map, power: int) -> Map:
         return _moment(values.T, reach, power).T
 
     rows, rising = down(weight, 0), down(inverse, 0)
@@ -203,7 +180,7 @@ def scatter(depth: np.ndarray, reach: int, slack: float) -> np.ndarray:
     return np.where(known, np.sqrt(np.maximum(yy - explained, 0)) / np.where(known, inverse, 1), 0)
 
 
-def _moment(values: np.ndarray, reach: int, power: int) -> np.ndarray:
+def _moment(values: Map, reach: int, power: int) -> Map:
     """Sum over the rows of a window around each pixel, [H, W], of values times a power of the row's offset."""
     padded, total = np.pad(values, ((reach, reach), (0, 0))), np.zeros_like(values)
     for offset in range(-reach, reach + 1):

@@ -18,7 +18,6 @@ from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.store.store import PriorStore
 
 cv2 = pytest.importorskip("cv2")
-
 ALIGN = AlignSettings()
 SIDE = 16
 """Of the one patch that stereo knows, pixels."""
@@ -41,10 +40,7 @@ def patch(depth: np.ndarray, seed: int) -> np.ndarray:
 
 
 def shown(
-    room: Recording,
-    kind: MonoKind = "relative",
-    turned: Callable[[str, np.ndarray], np.ndarray] | None = None,
-    unit: float = 1.0,
+    room: Recording, kind: MonoKind = "relative", turned: Callable | None = None, unit: float = 1.0
 ) -> dict[str, Shown]:
     """Each camera with a map that is exact but for its line (or `turned`), and one patch of depth, in `unit`s."""
     views = {}

@@ -17,7 +17,6 @@ from d2_plugin.store.maps import FusedPrior
 from d2_plugin.store.store import QUARTERS, PriorStore
 
 cv2 = pytest.importorskip("cv2")
-
 HEIGHT, WIDTH, FOCAL = 72, 192, 100.0
 RADIUS, BALL_DEPTH, WALL_DEPTH = 6, 2.0, 4.0
 FALL = np.array([0.0, 0.4, 0.0])

@@ -26,7 +26,6 @@ from d2_plugin.priors.dask_build import build_priors_on_cluster
 from d2_plugin.priors.monocular.align import align
 from d2_plugin.priors.settings import PriorSettings, StereoSettings
 from d2_plugin.priors.stereo import matched_depth
-from d2_plugin.priors.stereo.reuse import RADIUS, changed
 from d2_plugin.protocol import Label
 from d2_plugin.recordings import open_recording
 from d2_plugin.recordings.export.folder import save_recording
@@ -36,9 +35,7 @@ from d2_plugin.store.store import PriorStore
 
 pytest.importorskip("cv2")
 
-
 NAMES = ["train0", "train1", "train2"]
-
 SETTINGS = PriorSettings(stereo=StereoSettings(matcher="patchmatch"))
 
 
@@ -116,27 +113,16 @@ def test_the_summary_and_the_record_say_what_was_built(built: tuple) -> None:
     assert "emulated" in record["monocular"]
 
 
-def test_training_cameras_alone_are_read_and_matched_within_their_timestamp(plain, tmp_path, monkeypatch) -> None:
-    """Neither held-out cameras nor true depth."""
-    matched, reads = [], set()
+def test_training_cameras_alone_are_read_and_never_true_depth(plain: Recording, tmp_path: Path) -> None:
+    reads = set()
 
     def image(camera: str, frame: int) -> np.ndarray:
         reads.add((camera, frame))
         return plain.image(camera, frame)
 
     recording = showing(plain, {"image": image, "depth": lambda *_: pytest.fail("true depth was read")})
-    original = matched_depth.geometric_depth
-
-    def watch(images: list, *rest: object) -> list:
-        matched.append(images)
-        return original(images, *rest)
-
-    monkeypatch.setattr(matched_depth, "geometric_depth", watch)
     build_priors(recording, NAMES[:2], tmp_path, SETTINGS)
     assert reads == {(camera, frame) for camera in NAMES[:2] for frame in (0, 1)}
-    for frame, images in zip(recording.frames, matched, strict=True):
-        for camera, image in zip(NAMES, images):
-            np.testing.assert_array_equal(image, recording.image(camera, frame))
 
 
 def test_a_second_build_computes_nothing_and_changes_nothing(plain: Recording, built: tuple, monkeypatch) -> None:
@@ -159,9 +145,7 @@ def test_a_second_build_computes_nothing_and_changes_nothing(plain: Recording, b
         ({"patchmatch_device": "cpu"}, False),
     ],
 )
-def test_views_are_matched_again_where_a_setting_changed_that_matches_depend_on(
-    plain: Recording, begun: Path, monkeypatch: pytest.MonkeyPatch, change: dict[str, object], again: bool
-) -> None:
+def test_views_are_matched_again_where_a_setting_that_matters_changed(plain, begun, monkeypatch, change, again) -> None:
     no_stereo(monkeypatch)
     settings = replace(SETTINGS, stereo=replace(SETTINGS.stereo, **change))
     with pytest.raises(AssertionError) if again else contextlib.nullcontext():
@@ -248,16 +232,6 @@ def test_one_camera_has_no_depth_from_a_relative_map(plain: Recording, tmp_path:
     assert "one camera" in str(summary)
 
 
-def test_one_camera_has_mono_only_depth_from_a_metric_map(plain: Recording, tmp_path: Path) -> None:
-    metric = showing(plain, {"mono": plain.depth}, mono_kind="metric")
-    build_priors(metric, NAMES[:1], tmp_path, SETTINGS)
-    prior = PriorStore.open(tmp_path).prior("train0", 0)
-    assert set(np.unique(prior.labels)) <= {Label.MONO, Label.EMPTY}
-    alone = prior.support.numpy()
-    assert alone.mean() > 0.8
-    np.testing.assert_allclose(prior.depth.numpy()[alone], plain.depth("train0", 0)[alone], rtol=1e-4)
-
-
 def test_no_source_at_all_is_an_error(plain: Recording, tmp_path: Path) -> None:
     refuses("has no depth source", build_priors, replace(plain, mono_kind=None), NAMES[:1], tmp_path / "p", SETTINGS)
     assert not (tmp_path / "p").exists()
@@ -324,7 +298,6 @@ def test_mistakes_are_told_before_anything_is_written(plain, tmp_path, names, ch
 
 
 REUSE = PriorSettings(stereo=StereoSettings(matcher="patchmatch", reuse_block=3))
-
 STILL_NAMES = ["train0", "train1"]
 
 
@@ -342,21 +315,7 @@ def still_built(still: Recording, tmp_path_factory: pytest.TempPathFactory) -> P
     return path
 
 
-def test_a_change_is_what_outlasts_noise_and_its_neighbourhood_changes_with_it() -> None:
-    rng = np.random.default_rng(0)
-    before = np.full((60, 80), 100, np.uint8)
-    noisy = np.clip(before + rng.normal(0, 2, before.shape), 0, 255).astype(np.uint8)
-    assert changed(noisy, before).mean() < 0.02
-    moved = noisy.copy()
-    moved[30:34, 40:44] += 40
-    mask = changed(moved, before)
-    assert mask[30 - RADIUS : 34 + RADIUS, 40 - RADIUS : 44].all()
-    assert not mask[:15].any()
-
-
-def test_what_is_carried_over_is_not_matched_and_does_not_change_what_is_verified_by_much(
-    still: Recording, still_built: Path, tmp_path: Path
-) -> None:
+def test_what_is_carried_over_is_not_matched_and_is_verified_as_before_or_nearly(still, still_built, tmp_path) -> None:
     store = PriorStore.open(still_built)
     shares = [store.record("train0", frame)["stereo"]["matched_share"] for frame in still.frames]
     assert shares[0] == shares[3] == 1  # blocks of three
@@ -368,6 +327,7 @@ def test_what_is_carried_over_is_not_matched_and_does_not_change_what_is_verifie
     carried, matched = (errors_of(moved, each, Label.VERIFIED) for each in (store, full))
     assert len(carried) > 0.9 * len(matched)
     assert np.median(carried) < 1.1 * np.median(matched)
+    assert (carried > 0.05).mean() < (matched > 0.05).mean() + 0.01
 
 
 def test_a_build_that_stopped_within_a_block_goes_on_to_the_same_store(still, still_built, tmp_path) -> None:
@@ -384,10 +344,6 @@ def test_a_build_that_stopped_within_a_block_goes_on_to_the_same_store(still, st
     assert contents(tmp_path / "priors") == contents(still_built / "priors")
 
 
-needs_dask = pytest.mark.skipif(
-    importlib.util.find_spec("distributed") is None, reason="dask.distributed is not installed"
-)
-
 pytestmark = pytest.mark.filterwarnings("default")  # distributed deprecates its own parts between versions
 
 
@@ -400,7 +356,6 @@ def cluster() -> Iterator[object]:
         yield one_worker
 
 
-@needs_dask
 def test_a_worker_killed_in_the_middle_changes_no_byte_of_the_store(still, still_built, cluster, tmp_path) -> None:
     (worker,), killed, seen = cluster.workers.values(), [], []
 
@@ -425,10 +380,7 @@ def test_a_worker_killed_in_the_middle_changes_no_byte_of_the_store(still, still
         assert summary.shares[camera] == pytest.approx(alone.shares[camera])
 
 
-@needs_dask
-def test_what_a_single_build_refuses_the_cluster_refuses_in_the_same_words(
-    still: Recording, cluster: object, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_a_single_build_refuses_the_cluster_refuses_in_those_words(still, cluster, tmp_path, monkeypatch) -> None:
     with pytest.raises(D2Error, match="unknown camera 'train7'.*did you mean"):
         build_priors_on_cluster(still, ["train7"], tmp_path / "p", REUSE, scheduler=cluster.scheduler_address)
     client = importlib.import_module("distributed").Client

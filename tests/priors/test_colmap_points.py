@@ -47,8 +47,9 @@ def depth_errors(recording: Recording, names: list[str], points: SparsePoints, f
     return errors
 
 
-def test_points_of_two_views_lie_on_the_true_surfaces_and_carry_their_colour(recording: Recording) -> None:
+def test_points_of_two_views_lie_on_the_true_surfaces_and_carry_their_colour_without_a_word(recording, capfd) -> None:
     points = points_of(recording, ["train1", "train2"])
+    assert capfd.readouterr() == ("", "")
     assert len(points) > 100
     errors = depth_errors(recording, ["train1", "train2"], points)
     assert np.median(errors) < 0.005
@@ -102,12 +103,6 @@ def test_compression_survives_pycolmap_and_the_process_ends_silently_at_sigterm(
     code = "\n".join([imports, "import os, signal, zlib", ends])
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
     assert (done.returncode, done.stdout, done.stderr) == (-signal.SIGTERM, "alive\n", "")
-
-
-def test_colmap_is_quiet(recording: Recording, capfd: pytest.CaptureFixture) -> None:
-    points_of(recording, ["train1", "train2"])
-    told = capfd.readouterr()
-    assert told.out == told.err == ""
 
 
 def test_real_images_of_studio_give_accurate_points(shared_data) -> None:

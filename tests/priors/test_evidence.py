@@ -20,8 +20,6 @@ pytest.importorskip("cv2")
 
 WIDTH, HEIGHT, WALL, SIGMA = 40, 30, 4.0, 0.05
 TOLERANCE = 0.02
-
-
 CAMERAS = {name: camera_at((x, 0, 0), size=(WIDTH, HEIGHT), focal=30) for name, x in (("left", 0), ("right", 0.5))}
 
 

@@ -10,20 +10,13 @@ from prior_cases import camera_at, plane_seen_by
 
 from d2_plugin.priors.settings import StereoSettings
 from d2_plugin.priors.stereo.filtering.confirm import confirm
-from d2_plugin.priors.stereo.filtering.filter import (
-    COST_MAX,
-    filter_depths,
-    remove_speckles,
-    surface_coherence,
-    texture_mask,
-)
+from d2_plugin.priors.stereo.filtering.filter import filter_depths, remove_speckles, surface_coherence, texture_mask
 from d2_plugin.priors.stereo.filtering.precision import WINDOW, geometric_sigma, grey_gradient, plane_scatter
 from d2_plugin.priors.stereo.geometric_depth import gray
 from d2_plugin.recordings.recording import Recording
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 
 pytest.importorskip("cv2")
-
 
 SETTINGS = StereoSettings()
 
@@ -89,7 +82,7 @@ def test_a_match_among_wrong_ones_may_be_confirmed_by_a_map_where_another_view_h
 
 def test_bad_matches_are_dropped(recording: Recording) -> None:
     grays, cameras, depths, costs = views(recording)
-    costs[0] = np.full_like(costs[0], COST_MAX + 0.01)
+    costs[0] = np.full_like(costs[0], 0.51)
     results = filter_depths(grays, cameras, depths, costs, SETTINGS)
     assert not results[0].depth.any()
     assert not results[0].unconfirmed.any()

@@ -10,7 +10,7 @@ from prior_cases import camera_at
 from refusals import refuses
 
 from benchmarks.stereo_rigs import textured_rig
-from d2_plugin.priors.geometry import check_depth_range, check_views, pixel_grid, view_pair, viewing_rays
+from d2_plugin.priors.geometry import check_depth_range, check_views, view_pair
 from d2_plugin.priors.settings import StereoSettings
 from d2_plugin.priors.stereo.depth_range import depth_bounds
 from d2_plugin.priors.stereo.filtering.filter import GeometricDepth
@@ -20,8 +20,6 @@ from d2_plugin.recordings.synthetic.room import synthetic_recording
 
 pytest.importorskip("cv2")
 pytestmark = pytest.mark.usefixtures("compiler")
-
-
 SETTINGS = StereoSettings(matcher="patchmatch")
 
 
@@ -42,23 +40,16 @@ def run(recording: Recording, bounds: tuple[float, float], settings: StereoSetti
     return geometric_depth(images, list(recording.cameras.values()), bounds, settings)
 
 
-def scores(results: list[GeometricDepth], recording: Recording) -> tuple[float, float, float]:
-    """Completeness, median relative error and share of errors above 5 % over all views."""
-    truths = [recording.depth(name, 0) for name in recording.cameras]
-    errors = [np.abs(r.depth - t)[r.depth > 0] / t[r.depth > 0] for r, t in zip(results, truths)]
-    together = np.concatenate(errors)
-    completeness = float(np.mean([(r.depth > 0).mean() for r in results]))
-    return completeness, float(np.median(together)), float((together > 0.05).mean())
-
-
 def test_half_resolution_comes_back_at_full_size() -> None:
     pair = synthetic_recording(cameras=2, held_out=0, frames=1, width=256, height=144, arc_degrees=10)
     results = run(pair, (2.0, 9.0), replace(SETTINGS, max_pixels=128 * 72))
-    assert results[0].depth.shape == (144, 256)
-    completeness, median, wrong = scores(results, pair)
-    assert completeness > 0.05
-    assert median < 0.012
-    assert wrong < 0.03
+    found = np.stack([result.depth for result in results])
+    truth = np.stack([pair.depth(name, 0) for name in pair.cameras])
+    assert found.shape == (2, 144, 256)
+    assert (found > 0).mean() > 0.05
+    errors = np.abs(found / truth - 1)[found > 0]
+    assert np.median(errors) < 0.012
+    assert (errors > 0.05).mean() < 0.03
 
 
 def test_half_the_size_fills_what_the_full_size_leaves_empty(pair, matched, monkeypatch) -> None:
@@ -160,20 +151,8 @@ def views() -> tuple[list[np.ndarray], list[Camera]]:
     return [recording.image(name, 0) for name in recording.cameras], list(recording.cameras.values())
 
 
-def valid_share(images: list[np.ndarray], cameras: list[Camera]) -> float:
-    results = geometric_depth(images, cameras, BOUNDS, StereoSettings())
-    for result in results:
-        assert np.isfinite(result.depth).all()
-    return max(float((result.depth > 0).mean()) for result in results)
-
-
 def turned(camera: Camera, turn: np.ndarray) -> Camera:
     return replace(camera, name="turned", T_camera_world=turn @ camera.T_camera_world)
-
-
-SLIGHTLY = np.array([[0.999, -0.0447, 0, 0], [0.0447, 0.999, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
-
-AWAY = np.diag([-1.0, 1.0, -1.0, 1.0])
 
 
 @pytest.mark.parametrize("what", ["no texture", "faint noise", "one camera", "a pure rotation", "no overlap"])
@@ -181,15 +160,18 @@ def test_where_nothing_can_be_matched_there_is_next_to_no_depth(views: tuple, wh
     images, cameras = views
     rng = np.random.default_rng(0)
     noise = [np.clip(128 + rng.normal(0, 2, image.shape), 0, 255).astype(np.uint8) for image in images]
+    slightly, away = np.eye(4), np.diag([-1.0, 1.0, -1.0, 1.0])
+    slightly[:2, :2] = [[0.999, -0.0447], [0.0447, 0.999]]
     given = {
         "no texture": ([np.full_like(image, 128) for image in images], cameras),
         "faint noise": (noise, cameras),
         "one camera": ([images[0]] * 3, [cameras[0]] * 3),
-        "a pure rotation": ([images[0]] * 2, [cameras[0], turned(cameras[0], SLIGHTLY)]),
-        "no overlap": (images[:2], [cameras[0], turned(cameras[1], AWAY)]),
+        "a pure rotation": ([images[0]] * 2, [cameras[0], turned(cameras[0], slightly)]),
+        "no overlap": (images[:2], [cameras[0], turned(cameras[1], away)]),
     }
-    share = valid_share(*given[what])
-    assert share < 0.01 if what == "faint noise" else share == 0
+    for result in geometric_depth(*given[what], BOUNDS, StereoSettings()):
+        assert np.isfinite(result.depth).all()
+        assert (result.depth > 0).mean() <= (0.01 if what == "faint noise" else 0)
 
 
 def test_one_black_image_neither_has_depth_nor_takes_it_from_the_others(views: tuple) -> None:
@@ -231,14 +213,3 @@ def test_images_that_do_not_belong_to_the_cameras_are_refused() -> None:
     refuses("one image per camera", check_views, [image], pair)
     refuses("at least 2 cameras", check_views, [image], pair[:1])
     refuses("camera b is 32x24 pixels", check_views, [image, image[::2, ::2]], pair)
-
-
-def test_the_ray_of_a_pixel_projects_back_to_it_even_where_the_axes_are_skewed() -> None:
-    view = uneven()
-    view.K[0, 1] = 3.0
-    rays = viewing_rays(view, np.float64)
-    u, v = pixel_grid(view, np.float64)
-    at = (rays * 1e6) @ view.K.T
-    np.testing.assert_allclose(at[..., 0] / at[..., 2] - 0.5, np.broadcast_to(u, rays.shape[:2]), atol=1e-9)
-    np.testing.assert_allclose(at[..., 1] / at[..., 2] - 0.5, np.broadcast_to(v, rays.shape[:2]), atol=1e-9)
-    assert viewing_rays(view).dtype == np.float32

@@ -28,13 +28,23 @@ from d2_plugin.store.maps import FusedPrior
 
 pytest.importorskip("cv2")
 pytestmark = pytest.mark.usefixtures("compiler")
-
 SETTINGS = StereoSettings()
 TOLERANCE = 0.02
-
 Rig = tuple[list[np.ndarray], list[Camera], list[np.ndarray]]
 """Grey images, cameras, depth maps."""
 Maps = dict[str, np.ndarray]
+
+
+def assert_is_the_oracle(compiled: Callable[..., list[np.ndarray]], *given: object) -> None:
+    """What the kernels of stereo depth return has the bits of what NumPy does in their place."""
+    ours = compiled(*given)
+    with pytest.MonkeyPatch.context() as patch, np.errstate(all="ignore"):  # of pixels that are masked afterwards
+        patch.setattr(kernel, "run", oracle.run)
+        patch.setattr(confirm, "_add_source", oracle.add_source)
+        theirs = compiled(*given)
+    for one, other in zip(ours, theirs, strict=True):
+        assert one.dtype == other.dtype
+        np.testing.assert_array_equal(one, other)
 
 
 class TestStereoFilter:
@@ -57,13 +67,6 @@ class TestStereoFilter:
         shares = [surface_coherence(*pair) for pair in zip(grays, depths)]
         return shares + [map_ for i in range(len(cameras)) for map_ in confirm.confirm(i, cameras, depths, chosen)]
 
-    def expected(self, rig: Rig, chosen: StereoSettings = SETTINGS) -> list[np.ndarray]:
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(kernel, "run", oracle.run)
-            patch.setattr(confirm, "_add_source", oracle.add_source)
-            with np.errstate(all="ignore"):  # of pixels that are masked afterwards
-                return self.compiled(rig, chosen)
-
     @settings(max_examples=30, deadline=None)
     @given(
         count=st.integers(2, 4),
@@ -75,12 +78,8 @@ class TestStereoFilter:
         seed=st.integers(0, 1000),
     )
     def test_is_the_bits_of_the_oracle(self, count, width, height, exponent, noise, between, seed) -> None:
-        rig, chosen = (
-            self.rig(count, width, height, 10.0**exponent, noise, seed),
-            replace(SETTINGS, between_pixels=between),
-        )
-        for ours, theirs in zip(self.compiled(rig, chosen), self.expected(rig, chosen)):
-            np.testing.assert_array_equal(ours, theirs)
+        rig = self.rig(count, width, height, 10.0**exponent, noise, seed)
+        assert_is_the_oracle(self.compiled, rig, replace(SETTINGS, between_pixels=between))
 
     def test_is_the_bits_of_the_oracle_on_a_recording(self, shared_data: Callable[[str], Path]) -> None:
         recording, chosen = open_recording(shared_data("plaza")), ("00", "02", "05")
@@ -88,8 +87,7 @@ class TestStereoFilter:
         noise, truths = np.random.default_rng(0), [recording.depth(camera, 5) for camera in chosen]
         depths = [truth * noise.lognormal(0, 0.01, truth.shape).astype(np.float32) for truth in truths]
         rig = grays, [recording.cameras[camera] for camera in chosen], depths
-        for ours, theirs in zip(self.compiled(rig), self.expected(rig)):
-            np.testing.assert_array_equal(ours, theirs)
+        assert_is_the_oracle(self.compiled, rig)
 
     def test_does_not_depend_on_threads(self, same_for_any_threads: Callable) -> None:
         rig = self.rig(3, 61, 43, 1.0, 1e-3, 1)
@@ -142,11 +140,6 @@ class TestPrecision:
             depth = np.where(np.isfinite(maps["depth"]), maps["depth"], 0)
             return precision.geometric_sigma(**maps), precision.plane_scatter(depth, window)
 
-    def expected(self, maps: Maps, window: int = precision.WINDOW) -> tuple[np.ndarray, np.ndarray]:
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(kernel, "run", oracle.run)
-            return self.compiled(maps, window)
-
     @settings(max_examples=40, deadline=None)
     @given(
         width=st.integers(1, 70),
@@ -159,17 +152,14 @@ class TestPrecision:
     )
     def test_is_the_bits_of_the_oracle(self, width, height, exponent, noise, known, window, seed) -> None:
         maps = self.maps(width, height, 10.0**exponent, noise, known, seed)
-        for ours, theirs in zip(self.compiled(maps, window), self.expected(maps, window)):
-            assert ours.dtype == theirs.dtype
-            np.testing.assert_array_equal(ours, theirs)
+        assert_is_the_oracle(self.compiled, maps, window)
 
     @pytest.mark.parametrize("value", [1e-45, 1e-38, 1e-6, 1e6, 3e38, 0.0, -1.0, np.nan, np.inf])
     @pytest.mark.parametrize("name", ["depth", "coherence", "parallax", "spread", "gradient"])
     def test_is_the_bits_of_the_oracle_at_extremes(self, name: str, value: float) -> None:
         maps = self.maps(30, 20, 1.0, 1e-3, 0.9, 0)
         maps[name][::2, ::3] = value
-        for ours, theirs in zip(self.compiled(maps), self.expected(maps)):
-            np.testing.assert_array_equal(ours, theirs)
+        assert_is_the_oracle(self.compiled, maps)
         assert not np.isnan(self.compiled(maps)[0]).any()
 
     def test_does_not_depend_on_threads(self, same_for_any_threads: Callable) -> None:
@@ -200,18 +190,15 @@ class TestCrossView:
             cameras[str(index)] = view
         return priors, cameras
 
-    @staticmethod
-    def assert_same(one: Mapping[str, FusedPrior], other: Mapping[str, FusedPrior]) -> None:
-        for name, ours in one.items():
-            np.testing.assert_array_equal(ours.labels, other[name].labels)
-            np.testing.assert_allclose(ours.depth, other[name].depth, rtol=1e-6)
-            np.testing.assert_allclose(ours.sigma, other[name].sigma, rtol=1e-6)
-            assert (ours.depth.dtype, ours.sigma.dtype) == (np.float32, np.float32)
-
     def assert_is_the_oracle(self, priors, cameras, tails: Mapping[str, float] | None = None) -> None:
         with np.errstate(all="ignore"):
             compiled = with_evidence(priors, cameras, TOLERANCE, tails)
-            self.assert_same(compiled, cross_view_oracle.with_evidence(priors, cameras, TOLERANCE, tails))
+            expected = cross_view_oracle.with_evidence(priors, cameras, TOLERANCE, tails)
+        for name, ours in compiled.items():
+            np.testing.assert_array_equal(ours.labels, expected[name].labels)
+            np.testing.assert_allclose(ours.depth, expected[name].depth, rtol=1e-6)
+            np.testing.assert_allclose(ours.sigma, expected[name].sigma, rtol=1e-6)
+            assert (ours.depth.dtype, ours.sigma.dtype) == (np.float32, np.float32)
 
     @settings(max_examples=40, deadline=None)
     @given(

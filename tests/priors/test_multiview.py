@@ -82,10 +82,6 @@ def median_error(room: Recording, store: PriorStore, *labels: Label) -> float:
     return float(np.median(np.concatenate(errors)))
 
 
-def with_poses(poses: np.ndarray) -> list[Camera]:
-    return [Camera(str(i), 8, 6, np.eye(3), np.vstack([pose, [0, 0, 0, 1]])) for i, pose in enumerate(poses)]
-
-
 def test_files_are_read_as_the_exporters_name_their_arrays(room: Recording, tmp_path: Path) -> None:
     """Also where their scripts put them, below a folder of the instant; what a file holds besides is passed over."""
     arrays = emulated_multiview([room.depth(name, 0) for name in NAMES], list(room.cameras.values()), 0, posed=False)
@@ -150,9 +146,7 @@ def test_files_that_hold_no_prediction_are_one_sentence(tmp_path: Path) -> None:
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(2, 6), st.floats(-6, 6), st.booleans())
-def test_the_scale_of_poses_is_that_of_the_similarity_also_for_two_cameras_and_on_a_line(
-    seed: int, count: int, power: float, line: bool
-) -> None:
+def test_poses_have_the_scale_of_the_similarity_also_for_two_cameras_and_on_a_line(seed, count, power, line) -> None:
     rng = np.random.default_rng(seed)
     rotations = np.stack([rotation_of_vector(rng.normal(0, 1, 3)) for _ in range(count)])
     centres = np.outer(rng.permutation(count), rng.normal(0, 1, 3)) if line else rng.normal(0, 1, (count, 3))
@@ -161,7 +155,8 @@ def test_the_scale_of_poses_is_that_of_the_similarity_also_for_two_cameras_and_o
     moved = (centres - place) @ turn / scale
     poses = np.concatenate([theirs, -theirs @ moved[..., None]], axis=2)
     calibrated = np.concatenate([rotations, -rotations @ centres[..., None]], axis=2)
-    assert pose_scale(poses, with_poses(calibrated)) == pytest.approx(scale, rel=1e-6)
+    cameras = [Camera("", 8, 6, np.eye(3), np.vstack([pose, [0, 0, 0, 1]])) for pose in calibrated]
+    assert pose_scale(poses, cameras) == pytest.approx(scale, rel=1e-6)
 
 
 def test_maps_tell_their_scale_without_poses_and_overrule_wrong_ones(room: Recording) -> None:
@@ -348,9 +343,7 @@ def test_the_cameras_that_the_network_saw_may_be_more_and_in_another_order(room,
     refuses("trian0", build_priors, room, NAMES[:2], tmp_path / "prior", settings)
 
 
-def test_a_network_of_so_many_views_refuses_another_number_and_runs_once_an_instant(
-    room: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_network_of_so_many_views_refuses_another_number_and_runs_once_a_frame(room, tmp_path, monkeypatch) -> None:
     pytest.importorskip("onnxruntime")
     model = tiny_onnx.mean_network(tmp_path / "net.onnx", 45, 80, batch=3, named="depth")
     settings = replace(ALONE, multiview=str(model))

@@ -8,6 +8,7 @@ from functools import partial
 import numpy as np
 import pytest
 from prior_cases import camera_at
+from refusals import refuses
 
 from benchmarks.stereo_measure import measure
 from benchmarks.stereo_rigs import Rig, load_rigs, textured_rig
@@ -23,10 +24,7 @@ from d2_plugin.recordings.recording import Camera
 
 pytest.importorskip("cv2")
 pytestmark = pytest.mark.usefixtures("compiler")
-
 SETTINGS = StereoSettings()
-
-
 Maps = list[tuple[np.ndarray, np.ndarray]]
 """Depth and cost of each view."""
 
@@ -74,12 +72,6 @@ def test_studio_is_a_third_complete_although_two_walls_are_plain(shared_data) ->
 
 def test_the_number_of_threads_changes_no_bit(rig: Rig, same_for_any_threads: Callable) -> None:
     same_for_any_threads(lambda: [map_ for maps in raw(rig) for map_ in maps])
-
-
-def test_another_seed_changes_the_result_little(rig: Rig, native: Maps) -> None:
-    other = raw(rig, replace(SETTINGS, seed=1))
-    assert (native[0][0] != other[0][0]).any()
-    assert share_within(native, rig, 0.02) == pytest.approx(share_within(other, rig, 0.02), abs=0.03)
 
 
 def test_a_depth_range_ten_times_too_wide_does_no_harm(rig: Rig) -> None:
@@ -155,9 +147,13 @@ def test_the_unit_of_length_does_not_matter(rig: Rig, native: Maps, scale: float
     assert np.median(np.abs(other - metres)[metres > 0] / metres[metres > 0]) < 1e-3
 
 
-def upside_down_pair(disparity: int) -> tuple[list[np.ndarray], list[Camera], float]:
-    """A wall parallel to two cameras of which the second one stands on its head; and the wall's depth."""
-    rng = np.random.default_rng(0)
+def test_the_centre_of_pixel_i_is_at_i_plus_one_half() -> None:
+    """Of a wall parallel to two cameras of which the second one stands on its head.
+
+    Turned by 180 degrees about (W/2, H/2) pixel i falls on W - 1 - i; with any other centre the match is a pixel off,
+    which here is a tenth of the depth.
+    """
+    rng, disparity = np.random.default_rng(0), 10
     coarse = rng.normal(0, 1, (12, 24)).repeat(8, 0).repeat(8, 1)
     texture = np.clip(128 + 40 * coarse + 30 * rng.normal(0, 1, coarse.shape), 0, 255).astype(np.uint8)
     left, right = texture[:, :160], np.ascontiguousarray(texture[::-1, disparity : 160 + disparity][:, ::-1])
@@ -165,15 +161,8 @@ def upside_down_pair(disparity: int) -> tuple[list[np.ndarray], list[Camera], fl
     turned = np.diag([-1.0, -1.0, 1.0, 1.0])
     turned[0, 3] = 0.4  # the camera centre is .4 to the right, seen from a camera that is turned by 180 degrees
     cameras = [Camera("left", 160, 96, K, np.eye(4)), Camera("right", 160, 96, K, turned)]
-    return [np.ascontiguousarray(left), right], cameras, 150 * 0.4 / disparity
-
-
-def test_the_centre_of_pixel_i_is_at_i_plus_one_half() -> None:
-    # Turned by 180 degrees about (W/2, H/2) pixel i falls on W - 1 - i; with any other centre the match is a pixel off,
-    # which here is a tenth of the depth.
-    images, cameras, depth = upside_down_pair(disparity=10)
-    (found, cost), (back, _) = patchmatch(images, cameras, (2.0, 20.0))
-    inner = np.s_[10:-10, 20:-20]
+    (found, cost), (back, _) = patchmatch([np.ascontiguousarray(left), right], cameras, (2.0, 20.0))
+    depth, inner = 150 * 0.4 / disparity, np.s_[10:-10, 20:-20]
     assert np.median(np.abs(found[inner] / depth - 1)) < 5e-4
     assert np.median(np.abs(back[inner] / depth - 1)) < 5e-4
     assert np.median(cost[inner]) < 1e-3
@@ -216,7 +205,6 @@ def test_a_processor_without_wide_vectors_finds_the_same(rig: Rig, native: Maps,
 
 def test_a_mistake_is_one_sentence(rig: Rig) -> None:
     floats = [image / 255 for image in grays(rig)]
-    with pytest.raises(D2Error, match=r"uint8 \[H, W\], got float64"):
-        patchmatch(floats, rig.cameras, rig.depth_range)
+    refuses(r"uint8 \[H, W\], got float64", patchmatch, floats, rig.cameras, rig.depth_range)
     with pytest.raises(D2Error, match="patchmatch_sources must be at least 1 and at most 32, got 33"):
         raw(rig, replace(SETTINGS, patchmatch_sources=33))

@@ -23,9 +23,7 @@ from d2_plugin.store.store import FORMAT, PriorStore
 
 pytest.importorskip("cv2")
 
-
 SHAPE = (12, 17)
-
 IMAGE = np.random.default_rng(0).integers(0, 256, (*SHAPE, 3)).astype(np.uint8)
 
 
@@ -182,7 +180,6 @@ def test_frames_built_before_stay_part_of_the_store(store: PriorStore) -> None:
 
 
 NAMES = ["train0", "train1", "train2"]
-
 SETTINGS = PriorSettings(stereo=StereoSettings(matcher="patchmatch"))
 
 

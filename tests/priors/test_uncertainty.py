@@ -9,7 +9,7 @@ import pytest
 
 from d2_plugin.priors.fuse import fuse
 from d2_plugin.priors.monocular.align import align, aligned_depth
-from d2_plugin.priors.monocular.correct import corrected_depth, corrected_without
+from d2_plugin.priors.monocular.correct import corrected_depth
 from d2_plugin.priors.monocular.extrapolation import extrapolation_error
 from d2_plugin.priors.monocular.settings import AlignSettings
 from d2_plugin.priors.monocular.uncertainty import monocular_uncertainty
@@ -19,11 +19,7 @@ from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.store.maps import FusedPrior
 
 cv2 = pytest.importorskip("cv2")
-
-
 SETTINGS = AlignSettings()
-
-SEEDS = range(4)
 
 
 class Scene(NamedTuple):
@@ -40,7 +36,7 @@ class Scene(NamedTuple):
 
 @pytest.fixture(scope="module")
 def scenes() -> list[Scene]:
-    return [room(seed) for seed in SEEDS]
+    return [room(seed) for seed in range(4)]
 
 
 def room(seed: int) -> Scene:
@@ -164,7 +160,6 @@ def test_too_few_anchors_declare_nothing_however_large_the_image(scenes: list[Sc
 
 
 ROWS = np.arange(135)[:, None]
-
 WIDE = np.geomspace(1e-3, 1e6, 135 * 240).reshape(135, 240)
 
 STIFF: dict[str, Callable[[Scene], tuple[np.ndarray, np.ndarray]]] = {
@@ -243,7 +238,6 @@ def test_a_map_that_misses_some_things_is_less_sure_everywhere_and_vetoes_less(s
 
 
 FAR = 12.0
-
 KINDS: tuple[MonoKind, ...] = ("relative", "metric")
 
 
@@ -352,17 +346,6 @@ def test_a_size_that_no_cell_divides_is_no_special_case() -> None:
     aligned = rng.uniform(2, 4, (37, 641)).astype(np.float32)
     corrected = corrected_depth(aligned, (1.1 * aligned).astype(np.float32), SETTINGS)
     np.testing.assert_allclose(corrected, 1.1 * aligned, rtol=0.02)
-
-
-def test_each_choice_of_anchors_is_corrected_as_if_it_were_alone() -> None:
-    _, aligned, geometric = anchored_scene()
-    left_out = np.random.default_rng(1).random((3, *SHAPE)) < np.array([0, 0.5, 1])[:, None, None]
-    corrected = corrected_without(aligned, geometric, left_out, SETTINGS)
-    for index, hole in enumerate(left_out):
-        alone = corrected_depth(aligned, np.where(hole, np.float32(0), geometric), SETTINGS)
-        np.testing.assert_array_equal(corrected[index], alone)
-    np.testing.assert_array_equal(corrected[2], aligned, "without anchors there is no correction")
-    assert (corrected[0] != corrected[1]).any()
 
 
 def test_infinite_and_missing_anchors_change_nothing_around_them() -> None:

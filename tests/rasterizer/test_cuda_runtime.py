@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from refusals import refuses
 from splat_scenes import Path as Where
 from splat_scenes import prior_of, random_scene, shim_library, use_shim
 
@@ -74,8 +75,7 @@ def test_nvrtcs_own_words_are_in_the_error(compiler: nvrtc.Nvrtc) -> None:
 def test_without_nvrtc_the_message_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(nvrtc, "_files", lambda: iter(()))
     monkeypatch.setattr(ctypes, "CDLL", no_library)
-    with pytest.raises(nvrtc.NoCuda, match=r"NVRTC.*not found: run `pip install 'd2-4dgs\[cuda\]'`"):
-        nvrtc.Nvrtc()
+    refuses(r"NVRTC.*not found: run `pip install 'd2-4dgs\[cuda\]'`", nvrtc.Nvrtc, error=nvrtc.NoCuda)
 
 
 def test_without_a_driver_splatting_falls_back_with_one_warning(monkeypatch: pytest.MonkeyPatch) -> None:

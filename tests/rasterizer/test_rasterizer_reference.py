@@ -14,7 +14,6 @@ from d2_plugin.protocol import Label
 from d2_plugin.rasterizer import DepthPrior, RasterSettings, Splats, rasterize, reference, survey
 
 SETTINGS, SMOOTH = RasterSettings(), RasterSettings(antialiased=True)
-
 TRUSTED = (Label.VERIFIED, Label.AGREED)
 
 
@@ -219,6 +218,7 @@ def test_the_near_edge_of_a_prior_is_k_sigmas_before_its_depth() -> None:
     far = DepthPrior(torch.tensor([[50.0, 0.0]]), torch.full((1, 2), Label.FAR, dtype=torch.uint8))
     for sigma in (None, torch.tensor([[math.inf, 0.1]]), torch.tensor([[0.3, math.nan]])):
         assert far._replace(sigma=sigma).near_edge(2.0).tolist() == [[50.0, 0.0]], "the depth itself"
+    assert far._replace(sigma=torch.full((1, 2), math.inf)).measured, "far pixels alone know free space"
     every = DepthPrior(torch.full((1, len(Label)), 2.0), torch.arange(len(Label), dtype=torch.uint8)[None])
     trusted = [2.0 if label in (Label.VERIFIED, Label.AGREED, Label.FAR) else 0.0 for label in Label]
     assert every.near_edge(3.0).tolist() == [trusted], "without sigma the depth of trusted pixels"

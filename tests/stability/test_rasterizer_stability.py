@@ -4,18 +4,7 @@ import math
 
 import pytest
 import torch
-from splat_scenes import (
-    CPU,
-    Path,
-    Scene,
-    brute_force,
-    covariance,
-    make_view,
-    near_edge_of,
-    path_of,
-    random_scene,
-    single,
-)
+from splat_scenes import Path, Scene, brute_force, covariance, make_view, near_edge_of, path_of, random_scene, single
 from torch import Tensor
 from torch.autograd import gradcheck
 
@@ -270,7 +259,7 @@ def test_case_39_unequal_focal_lengths_and_a_principal_point_outside_the_image(p
     means = torch.cat([rays, torch.ones(60, 1)], 1) * scene.means[:, 2:]
     scene = Scene(means.float().double(), *scene[1:4], View("cam", 0, 0.0, torch.eye(4), K, 23, 19))
     found = brute_force(scene)
-    alpha = scene.on(path).render().alpha.to(CPU).double()
+    alpha = scene.on(path).render().alpha.cpu().double()
     assert (alpha - torch.from_numpy(found.weights.sum(0)))[found.away()].abs().max() < 1e-4
     assert alpha.max() > 0.3, "they are in the image"
 
