@@ -10,13 +10,13 @@ import torch
 from mimics.ex4dgs import opacity_compensation
 from mimics.inria import Camera
 from rasterizer_arguments import gaussians, inria_camera
+from refusals import refuses
 from slice_scenes import GOLDEN
 from splat_scenes import random_scene, single
 from torch import Tensor
 
 from d2_plugin.compat import ex4dgs, fourd, kinematic, nearest, spacetime, vision
 from d2_plugin.compat.python_config import Config
-from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.rotation4d import rotation_matrices_3d
 from d2_plugin.gaussians.spherical_harmonics import colors as harmonic_colors
 from d2_plugin.protocol import RasterSettings, Splats
@@ -135,8 +135,7 @@ class TestFourD:
 
     def test_missing_time_is_one_sentence(self, camera: dict) -> None:
         raster = fourd.GaussianRasterizer(fourd.GaussianRasterizationSettings(**camera, **FOUR, force_sh_3d=False))
-        with pytest.raises(D2Error, match="4D Gaussians need ts and scales_t"):
-            raster(**gaussians())
+        refuses("4D Gaussians need ts and scales_t", raster, **gaussians())
 
 
 class TestSpacetime:

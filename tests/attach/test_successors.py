@@ -7,6 +7,7 @@ import pytest
 import torch
 from mimics import gsplat, gsplat_dynamic
 from mimics.workplace import some_points
+from refusals import refuses
 from repositories import clone, make_cem4dgs, make_gsplat, make_gsplat_dynamic, make_swift4d
 from torch import Tensor, nn
 
@@ -65,8 +66,7 @@ class TestGsplat:
             GsplatAdapter(splats, optimizers).insert(some_points(2))
         adapter = GsplatAdapter(splats, optimizers, new_rows=lambda points: {"velocities": 0 * points.positions})
         assert adapter.insert(some_points(2)) == 2
-        with pytest.raises(D2Error, match="have means but no 'scales'"):
-            GsplatAdapter({"means": splats["means"]}, optimizers)
+        refuses("have means but no 'scales'", GsplatAdapter, {"means": splats["means"]}, optimizers)
 
     def test_a_scene_is_told_of_rows_that_come_and_go(self) -> None:
         """gsplat 1.6 keeps a component per row beside the parameters, and its own split fails where one is missing."""
@@ -136,5 +136,4 @@ class TestGsplatDynamic:
             GsplatDynamicAdapter(params, optimizers, {}, hexplane, net)
         state = {"dynamic_mask": torch.ones(60, dtype=torch.bool)}
         adapter = GsplatDynamicAdapter(params, optimizers, state, hexplane, net)
-        with pytest.raises(D2Error, match=r"got no number of frames: pass views.*`frames=`"):
-            adapter.view(gsplat_dynamic.items()[0])
+        refuses(r"got no number of frames: pass views.*`frames=`", adapter.view, gsplat_dynamic.items()[0])
