@@ -19,6 +19,7 @@ from typing import Any
 
 import pytest
 import torch
+from fuzzing import leaves
 
 COUNT, FAIL_ONCE, FAIL_FROM, KILL_BEFORE_RENAME, KILL_AFTER_RENAME = range(5)
 PRELOADED = [
@@ -146,13 +147,5 @@ def _content(path: Path) -> Any:
     if path.name == "checkpoint.pt":
         state = torch.load(path, weights_only=True)
         del state["seconds"], state["cpu_seconds"]
-        return _digest(state)
+        return leaves(state)
     return hashlib.sha256(path.read_bytes()).hexdigest()
-
-
-def _digest(state: Any) -> Any:
-    if isinstance(state, torch.Tensor):
-        return hashlib.sha256(state.numpy().tobytes()).hexdigest()
-    if isinstance(state, dict):
-        return {str(name): _digest(value) for name, value in state.items()}
-    return [_digest(value) for value in state] if isinstance(state, list | tuple) else state

@@ -43,12 +43,7 @@ READERS = [
     ("spacetime", {"image_name": "cam04", "timestamp": 0.5}, ("cam04", 1)),
     ("spacetime", {"image_name": "camera_0001", "timestamp": 0.0}, ("camera_0001", 0)),
     ("ex4dgs", {"image_path": "/d/sear_steak/cam12/47.png", "image_name": "47.png", "timestamp": 40}, ("cam12", 47)),
-    (
-        "ex4dgs",
-        {"image_path": "/d/Birthday/Birthday_undist_00151_10.png", "image_name": "Birthday_undist_00151_10.png"},
-        ("10", 151),
-    ),
-    ("ex4dgs", {"image_path": "/d/Painter/Painter_undist_00000_00.png", "image_name": "-"}, ("00", 0)),
+    ("ex4dgs", {"image_path": "/d/Painter/Painter_undist_00151_10.png", "image_name": "-"}, ("10", 151)),
 ]
 
 

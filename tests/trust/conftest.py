@@ -12,7 +12,6 @@ import pytest
 from recorded import write_video
 from trust_commands import Commands, Fault, contents
 
-from d2_plugin.recordings.export.folder import save_recording
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.runs.report.report import BUILDERS
 from d2_plugin.runs.rows import append_rows, read_rows
@@ -69,9 +68,8 @@ def commands(tmp_path_factory: pytest.TempPathFactory) -> Commands:
 
 
 @pytest.fixture(scope="session")
-def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    recording = synthetic_recording(cameras=2, held_out=1, frames=2, width=96, height=54, arc_degrees=15)
-    return save_recording(recording, tmp_path_factory.mktemp("trust") / "room")
+def recording(saved_room: Callable[..., Path]) -> Path:
+    return saved_room(cameras=2, held_out=1, frames=2, width=96, height=54, arc_degrees=15)
 
 
 @pytest.fixture(scope="session")
