@@ -55,6 +55,15 @@ def saved_room(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
     return write
 
 
+@pytest.fixture(scope="session")
+def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The smallest recording that a command takes, to be read only."""
+    pytest.importorskip("cv2", reason="opencv is in the `image` extra")
+    from small_layouts import write_layout
+
+    return write_layout("folder", tmp_path_factory.mktemp("recording") / "small")
+
+
 @pytest.fixture
 def refused(capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
     """The sentence with which a command line is refused."""

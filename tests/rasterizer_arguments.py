@@ -7,7 +7,7 @@ from torch import Tensor
 from d2_plugin.protocol import View
 
 
-def inria_camera(view: View, world_view: Tensor | None = None) -> dict:
+def inria_camera(view: View) -> dict:
     """The two matrices as the repositories make them (utils/graphics_utils.py), acting on row vectors."""
     near, far = 0.01, 100.0
     K, width, height = view.K.double(), view.width, view.height
@@ -15,7 +15,7 @@ def inria_camera(view: View, world_view: Tensor | None = None) -> dict:
     projection[0, 0], projection[1, 1] = 2 * K[0, 0] / width, 2 * K[1, 1] / height
     projection[0, 2], projection[1, 2] = 2 * K[0, 2] / width - 1, 2 * K[1, 2] / height - 1
     projection[2, 2], projection[2, 3], projection[3, 2] = far / (far - near), -far * near / (far - near), 1
-    world_view = view.T_camera_world.double().T if world_view is None else world_view
+    world_view = view.T_camera_world.double().T
     return {
         "image_height": height,
         "image_width": width,

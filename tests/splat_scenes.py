@@ -150,12 +150,10 @@ def random_scene(seed: int, count: int, width: int, height: int, channels: int =
     return Scene(*(part.float().double() for part in parts), view)
 
 
-def single(
-    depth: float = 4.0, opacity: float = 0.5, variance: float = 0.01, size: int = 15, dtype: torch.dtype = torch.float64
-) -> Scene:
+def single(depth: float = 4.0, opacity: float = 0.5, variance: float = 0.01, size: int = 15) -> Scene:
     """One round Gaussian in front of the middle pixel of a square image."""
     numbers = ([[0.0, 0, depth]], [[variance, 0, 0, variance, 0, variance]], [opacity], [[1.0, 0.5, 0.25]])
-    return Scene(*(torch.tensor(part, dtype=dtype) for part in numbers), make_view(size, size))
+    return Scene(*(torch.tensor(part, dtype=torch.float64) for part in numbers), make_view(size, size))
 
 
 def near_edge_of(view: View, seed: int = 3) -> Tensor:
@@ -217,7 +215,7 @@ def brute_force(scene: Scene, settings: RasterSettings = RasterSettings()) -> Fr
         x, y, z = points[i]
         if z <= settings.near:
             continue
-        screen = _screen_covariance(covariances[i], pose[:3, :3], x, y, z, K, view, settings)
+        screen = _screen_covariance(covariances[i], pose[:3, :3], points[i], view, settings)
         inverse, share = np.linalg.inv(screen), 1.0
         if settings.antialiased:
             own = np.linalg.det(screen - settings.blur * np.eye(2)) / np.linalg.det(screen)
@@ -234,20 +232,13 @@ def brute_force(scene: Scene, settings: RasterSettings = RasterSettings()) -> Fr
 
 
 def _screen_covariance(
-    covariances: np.ndarray,
-    R: np.ndarray,
-    x: float,
-    y: float,
-    z: float,
-    K: np.ndarray,
-    view: View,
-    settings: RasterSettings,
+    covariances: np.ndarray, R: np.ndarray, point: np.ndarray, view: View, settings: RasterSettings
 ) -> np.ndarray:
     xx, xy, xz, yy, yz, zz = covariances
-    world = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    world, K = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]), view.K.double().numpy()
     limits = []
-    for slope, size, focal, middle in ((x / z, view.width, K[0, 0], K[0, 2]), (y / z, view.height, K[1, 1], K[1, 2])):
+    for slope, size, focal, middle in zip(point[:2] / point[2], (view.width, view.height), K.diagonal(), K[:, 2]):
         centre, half = (size / 2 - middle) / focal, settings.fov_clamp * size / 2 / focal
         limits.append(np.clip(slope, centre - half, centre + half))
-    jacobian = np.array([[K[0, 0], 0, -K[0, 0] * limits[0]], [0, K[1, 1], -K[1, 1] * limits[1]]]) / z
+    jacobian = np.array([[K[0, 0], 0, -K[0, 0] * limits[0]], [0, K[1, 1], -K[1, 1] * limits[1]]]) / point[2]
     return jacobian @ R @ world @ R.T @ jacobian.T + settings.blur * np.eye(2)

@@ -1,12 +1,21 @@
-"""The house: a room for every idea and imports that run one way, and all of it is packaged and documented."""
+"""The house: a room for every idea and imports that run one way; all of it is packaged, and what it says is true."""
 
 import ast
 import configparser
 import functools
 import re
+import tomllib
 from collections.abc import Iterable, Iterator
 from graphlib import TopologicalSorter
+from importlib.metadata import version
 from pathlib import Path
+
+import pytest
+import yaml
+
+import d2_plugin
+from d2_plugin.commands.doctor import OPTIONAL
+from d2_plugin.errors import missing_extra
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = {"d2_plugin": "d2_plugin", "d2_plugin.backbones": "backbones", "d2_plugin.adapters": "adapters"}
@@ -114,11 +123,16 @@ def test_imports_run_one_way_between_rooms() -> None:
     assert wrong == []
 
 
-def test_every_package_and_every_kernel_is_installed() -> None:
+@pytest.fixture(scope="module")
+def setup() -> configparser.ConfigParser:
+    parser = configparser.ConfigParser(delimiters=("=",), interpolation=None)
+    parser.optionxform = str
+    parser.read(ROOT / "setup.cfg")
+    return parser
+
+
+def test_every_package_and_every_kernel_is_installed(setup: configparser.ConfigParser) -> None:
     """What setup.cfg's `packages` and `package_data` say the tree has, and the other way round."""
-    setup = configparser.ConfigParser(delimiters=("=",))
-    setup.optionxform = str
-    setup.read(ROOT / "setup.cfg")
     places = dict(re.split(r"\s*=\s*", line) for line in setup["options"]["package_dir"].split("\n") if line.strip())
     listed = {name: ROOT / places.get(name, name.replace(".", "/")) for name in setup["options"]["packages"].split()}
     tops = [ROOT / "d2_plugin", *(ROOT / place for place in places.values())]
@@ -147,3 +161,51 @@ def test_every_document_that_is_named_is_there() -> None:
             found = [name for name in names if (ROOT / name).exists() or (path.parent / name).exists()]
             missing += [f"{path.relative_to(ROOT)}, line {number}: {name}" for name in names if name not in found]
     assert missing == []
+
+
+CODE = ("d2_plugin", "backbones", "adapters")
+
+
+def extras_in(text: str) -> set[str]:
+    """Extras of this package that a text names, in `d2-4dgs[one,two]` or `.[one,two]`."""
+    return {name.strip() for group in re.findall(r"(?:d2-4dgs|\.)\[([a-z, ]+)\]", text) for name in group.split(",")}
+
+
+def test_one_version_everywhere(setup: configparser.ConfigParser) -> None:
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text()).get("project", {})
+    assert "version" not in project, "pyproject.toml has a version of its own"
+    assert setup["metadata"]["version"] == "attr: d2_plugin.__version__"
+    assert version("d2-4dgs") == d2_plugin.__version__
+    assert citation["version"] == d2_plugin.__version__
+    released = re.findall(r"^## \[(\d[^\]]*)\]", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.MULTILINE)
+    assert released[0] == d2_plugin.__version__
+
+
+def test_every_extra_in_an_error_exists(setup: configparser.ConfigParser) -> None:
+    code = [path.read_text(encoding="utf-8") for folder in CODE for path in (ROOT / folder).rglob("*.py")]
+    call = r'(?:missing_extra|opencv)\([^(),]*,\s*"([^"]+)"'  # opencv(purpose, extra) hands its extra on
+    named = {extra for text in code for extra in re.findall(call, text)}
+    assert "calibration" in named
+    assert named <= set(setup["options.extras_require"])
+    assert extras_in(str(missing_extra("OpenCV", "image", "reading images"))) == {"image"}
+
+
+def test_every_extra_in_text_exists(setup: configparser.ConfigParser) -> None:
+    known = set(setup["options.extras_require"])
+    files = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "setup.cfg", ROOT / ".ci" / "run"]
+    files += [path for folder in CODE for path in (ROOT / folder).rglob("*.py")] + list((ROOT / "docs").rglob("*.md"))
+    named = {path.name: extras_in(path.read_text(encoding="utf-8")) - known for path in files}
+    assert not {name: extras for name, extras in named.items() if extras}
+    assert extras_in("pip install -e '.[all,tset]' d2-4dgs[mono]") == {"all", "tset", "mono"}
+
+
+def test_every_package_that_doctor_names_is_in_the_extra_that_it_names(setup: configparser.ConfigParser) -> None:
+    distributions = {"cv2": "opencv-contrib-python-headless"}
+    for module, (extra, *_) in OPTIONAL.items():
+        assert distributions.get(module, module) in setup["options.extras_require"][extra], f"{module} not in {extra}"
+
+
+def test_every_extra_of_a_user_is_in_all(setup: configparser.ConfigParser) -> None:
+    together = extras_in(setup["options.extras_require"]["all"])
+    assert together == set(setup["options.extras_require"]) - {"all", "test", "cuda", "older"}

@@ -4,9 +4,6 @@ import errno
 import io
 import json
 import os
-import signal
-import subprocess
-import sys
 import time
 import zipfile
 from concurrent.futures import ThreadPoolExecutor
@@ -160,30 +157,12 @@ def test_a_flipped_bit_of_an_archive_is_seen_before_anybody_reads_it(tmp_path: P
         pass
 
 
-HOLD = (
-    "import sys, time; from pathlib import Path; from d2_plugin.locks import only_writer\n"
-    "with only_writer(Path(sys.argv[1])): print('held', flush=True); time.sleep(60)"
-)
-
-
 def test_a_second_writer_is_refused_with_one_sentence_until_the_first_ends(tmp_path: Path) -> None:
     with only_writer(tmp_path), pytest.raises(Busy, match="another process is writing .*: wait until it has ended"):
         only_writer(tmp_path).__enter__()
     with only_writer(tmp_path):
         pass
     assert list(tmp_path.iterdir()) == [], "a lock is no file"
-
-
-def test_the_lock_of_a_killed_process_is_free(tmp_path: Path) -> None:
-    process = subprocess.Popen([sys.executable, "-c", HOLD, str(tmp_path)], stdout=subprocess.PIPE, text=True)
-    assert process.stdout.readline() == "held\n"
-    with pytest.raises(Busy):
-        only_writer(tmp_path).__enter__()
-    process.send_signal(signal.SIGKILL)
-    process.wait()
-    process.stdout.close()
-    with only_writer(tmp_path):
-        pass
 
 
 def test_many_may_write_beside_each_other_and_the_first_tidies(tmp_path: Path) -> None:

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import ctypes
 import hashlib
+import itertools
 import json
 import multiprocessing
 import os
 import re
-import shutil
 import signal
-import subprocess
 import sys
 import time
 from dataclasses import dataclass
@@ -18,9 +17,10 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
+import pytest
 import torch
+from fuzzing import leaves
 
-SOURCE = Path(__file__).parent / "trust" / "faults.c"
 COUNT, FAIL_ONCE, FAIL_FROM, KILL_BEFORE_RENAME, KILL_AFTER_RENAME = range(5)
 PRELOADED = [
     *("torch", "torch._dynamo", "torch.onnx", "sympy", "cv2", "pycolmap"),
@@ -61,40 +61,24 @@ class Ended:
         return told[0]
 
 
-def compiled_faults(folder: Path) -> Path | None:
-    """The library to preload, None where nothing compiles C."""
-    compiler = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
-    if compiler is None or not sys.platform.startswith("linux"):
-        return None
-    library = folder / "faults.so"
-    subprocess.run([compiler, "-shared", "-fPIC", "-O1", str(SOURCE), "-o", str(library), "-ldl", "-lrt"], check=True)
-    return library
-
-
 class Commands:
-    """Starts commands; `library` is what `compiled_faults` made, or None where none shall fail."""
+    """Starts commands, into which the library made of faults.c is loaded first."""
 
-    def __init__(self, library: Path | None, logs: Path) -> None:
-        self.logs, self._count = logs, 0
+    def __init__(self, library: Path, logs: Path) -> None:
+        self.logs, self._numbers = logs, itertools.count()
         self._context = multiprocessing.get_context("forkserver")
         self._context.set_forkserver_preload(PRELOADED)
-        changed = {"OMP_NUM_THREADS": "1", "LD_PRELOAD": "" if library is None else str(library)}
-        before = {name: os.environ.get(name) for name in changed}
-        os.environ.update(changed)
-        try:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setenv("OMP_NUM_THREADS", "1")
+            patch.setenv("LD_PRELOAD", str(library))
             first = self._context.Process(target=os.getpid)  # starts the process that the others are forked from
             first.start()
             first.join()
-        finally:
-            for name, value in before.items():
-                os.environ.pop(name) if value is None else os.environ.update({name: value})
 
     def start(self, words: list[str], fault: Fault | None = None, kill_after: float | None = None) -> Started:
         """A command that runs while this one goes on; it is killed (SIGKILL) after so many CPU seconds."""
-        self._count += 1
-        log = self.logs / f"{os.getpid()}-{self._count}.log"
-        armed = None if fault is None else (str(fault.folder), fault.how, fault.at, fault.error)
-        process = self._context.Process(target=_command, args=(words, str(log), armed, kill_after))
+        log = self.logs / f"{os.getpid()}-{next(self._numbers)}.log"
+        process = self._context.Process(target=_command, args=(words, str(log), fault, kill_after))
         process.start()
         return Started(process, log)
 
@@ -123,7 +107,7 @@ def killed(ended: Ended) -> bool:
     return ended.code == -signal.SIGKILL
 
 
-def _command(words: list[str], log: str, fault: tuple[str, int, int, int] | None, kill_after: float | None) -> None:
+def _command(words: list[str], log: str, fault: Fault | None, kill_after: float | None) -> None:
     descriptor = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
     os.dup2(descriptor, 1)
     os.dup2(descriptor, 2)
@@ -135,8 +119,8 @@ def _command(words: list[str], log: str, fault: tuple[str, int, int, int] | None
     be_silent()
     shim = ctypes.CDLL(None)
     if fault is not None:
-        folder, how, at, error = fault
-        shim.d2_fault_arm(folder.encode(), ctypes.c_int(how), ctypes.c_long(at), ctypes.c_int(error))
+        numbers = ctypes.c_int(fault.how), ctypes.c_long(fault.at), ctypes.c_int(fault.error)
+        shim.d2_fault_arm(str(fault.folder).encode(), *numbers)
     if kill_after is not None:
         assert shim.d2_fault_kill_after(ctypes.c_double(kill_after)) == 0
     code = main(words)
@@ -163,13 +147,5 @@ def _content(path: Path) -> Any:
     if path.name == "checkpoint.pt":
         state = torch.load(path, weights_only=True)
         del state["seconds"], state["cpu_seconds"]
-        return _digest(state)
+        return leaves(state)
     return hashlib.sha256(path.read_bytes()).hexdigest()
-
-
-def _digest(state: Any) -> Any:
-    if isinstance(state, torch.Tensor):
-        return hashlib.sha256(state.numpy().tobytes()).hexdigest()
-    if isinstance(state, dict):
-        return {str(name): _digest(value) for name, value in state.items()}
-    return [_digest(value) for value in state] if isinstance(state, list | tuple) else state

@@ -115,12 +115,11 @@ def standing(mimic: ModuleType, make_adapter: Callable[[Any, Any], Backbone], **
     return inria(mimic, model, lambda: make_adapter(model, scene), cameras, **options)
 
 
-def make_swift4d(stage: str = "fine") -> Standing:
-    return standing(swift4d, lambda model, scene: Swift4DAdapter(model, scene, stage), stage=stage)
+def staged(mimic: ModuleType, adapter: Callable[..., Backbone], stage: str = "fine") -> Standing:
+    return standing(mimic, lambda model, scene: adapter(model, scene, stage), stage=stage)
 
 
-def make_hust4d(stage: str = "fine") -> Standing:
-    return standing(hust4d, lambda model, scene: Hust4DAdapter(model, scene, stage), stage=stage)
+make_swift4d = partial(staged, swift4d, Swift4DAdapter)
 
 
 def make_cem4dgs() -> Standing:
@@ -210,8 +209,8 @@ VARIANTS: dict[str, Callable[[], Standing]] = {
     "fudan": partial(standing, fudan, FudanAdapter),
     "spacetime": partial(standing, spacetime, lambda model, scene: SpacetimeAdapter(model, 2)),
     "ex4dgs": partial(standing, ex4dgs, lambda model, scene: Ex4DGSAdapter(model)),
-    "hust4d": make_hust4d,
-    "hust4d coarse": partial(make_hust4d, "coarse"),
+    "hust4d": partial(staged, hust4d, Hust4DAdapter),
+    "hust4d coarse": partial(staged, hust4d, Hust4DAdapter, "coarse"),
     "deformable3d": make_deformable3d,
     "deformable3d 6dof": partial(make_deformable3d, True),
     "gsplat": make_gsplat,

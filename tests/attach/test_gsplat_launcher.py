@@ -1,6 +1,7 @@
 """gsplat's simple_trainer through the launcher: its modules in small, a stand-in to draw, cameras told by pose."""
 
 import importlib
+import re
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -128,12 +129,15 @@ def test_without_hooks_the_script_ends_with_the_same_bits() -> None:
 
 
 @pytest.mark.usefixtures("checkout")
-def test_hooks_insert_remove_and_pull_on_depth() -> None:
+def test_hooks_insert_remove_and_pull_on_depth_and_the_scripts_own_growth_is_said_once(caplog) -> None:
     attached, session = trained(HOOKS)
     log = session.hooks.log
     assert log.inserted > 0
     assert len(attached["means"]) == len(session.hooks.backbone)
     assert {entry.hook for entry in session.hooks.trace} == {"densify", "prune", "depth_loss"}
+    said = re.findall(r"the trainer's own densification has made (\d+) Gaussians beside the (\d+)", caplog.text)
+    assert len(said) == 1, caplog.text
+    assert int(said[0][0]) > int(said[0][1]) > 0
 
 
 @pytest.mark.usefixtures("checkout")

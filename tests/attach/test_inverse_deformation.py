@@ -4,7 +4,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from d2_plugin.adapters.inverse_deformation import invert_deformation, neighbour_offsets
+from d2_plugin.adapters.inverse_deformation import invert_at_times, invert_deformation, neighbour_offsets
+from d2_plugin.protocol import Points
 
 
 def targets_of(count: int = 200, seed: int = 0) -> Tensor:
@@ -62,14 +63,12 @@ def test_a_field_that_returns_nan_is_not_accepted_and_stays_finite() -> None:
     assert inversion.positions.isfinite().all()
 
 
-def test_every_point_may_have_its_own_time_and_tolerance() -> None:
-    targets, times = targets_of(3), torch.tensor([0.0, 1.0, 2.0])
-
-    def drift(x: Tensor) -> Tensor:
-        return x + times[:, None] * torch.tensor([1.0, 0.0, 0.0])
-
-    inversion = invert_deformation(drift, targets, NOBODY, NOBODY, tolerance=torch.tensor([1e-5, 1e-5, 1e-5]))
-    torch.testing.assert_close(inversion.positions, drift(targets) * -1 + 2 * targets)
+def test_every_point_is_inverted_at_its_own_time() -> None:
+    targets, times, ones = targets_of(3), torch.tensor([0.0, 1.0, 2.0]), torch.ones(3)
+    wind = torch.tensor([1.0, 0.0, 0.0])
+    points = Points(targets, targets, times, ones, ones)
+    inversion = invert_at_times(points, lambda x, time: x + time * wind, NOBODY)
+    torch.testing.assert_close(inversion.positions, targets - times[:, None] * wind)
     assert inversion.accepted.all()
 
 

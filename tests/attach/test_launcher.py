@@ -23,7 +23,6 @@ from d2_plugin.attach.packages import provide
 from d2_plugin.attach.recipes import RECIPES, recipe
 from d2_plugin.attach.session import Original, Session
 from d2_plugin.config import DepthLossConfig
-from d2_plugin.hooks.reports import Report, RunLog
 
 DEPTH_LOSS = D2Config(depth_loss=DepthLossConfig(start=2))
 OPTIONS = default_options(iterations=12, densify_until_iter=0)
@@ -102,16 +101,6 @@ class TestSession:
         positions, session = run_wrapped(HOOKS, monkeypatch)
         assert session.hooks.log.inserted > 0
         assert len(positions) == len(session.hooks.backbone)
-
-    def test_growth_beyond_what_was_inserted_is_logged_once(self, caplog: pytest.LogCaptureFixture) -> None:
-        session = Session(recipe("fudan"), HOOKS, TinyStore())
-        done = RunLog({})
-        done._at_first = 100  # Gaussians when D2 was attached
-        for step, (inserted, removed, count) in enumerate([(10, 0, 130), (0, 20, 120), (0, 0, 121), (0, 0, 121)], 1):
-            done.record_step(Report(inserted, removed, count, step))
-            session._note_growth(done)
-        assert len(caplog.records) == 1
-        assert "iteration 3: the trainer's own densification has made 31 Gaussians beside the 10" in caplog.text
 
 
 def test_stages_of_4dgaussians_reach_the_adapter() -> None:

@@ -7,7 +7,7 @@ from functools import partial
 
 import pytest
 import torch
-from tiny import BACKBONES, make_adapter, make_model, make_views
+from tiny import BACKBONES, bend_field, make_adapter, make_model, make_views
 from torch import Tensor
 from torch.optim import Optimizer
 
@@ -19,11 +19,7 @@ from d2_plugin.testing import CHECKS, ContractError, Example, check_backbone
 
 def make(backbone: str = "yang4d", temporal: bool = True) -> Example:
     """An example of a bundled backbone with everything that can be checked."""
-    model = make_model(backbone=backbone, temporal=temporal)
-    if getattr(model, "field", None) is not None:
-        with torch.no_grad():
-            for parameter in model.field.heads.parameters():
-                parameter.uniform_(-0.05, 0.05, generator=torch.Generator().manual_seed(1))
+    model = bend_field(make_model(backbone=backbone, temporal=temporal), 0.05)
 
     def split_some() -> None:
         model.gaussians.statistics["seen"].fill_(1)

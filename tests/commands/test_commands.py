@@ -1,4 +1,4 @@
-"""Every `d2` command as a person meets it: its help, its flags, and tables given by flags."""
+"""Every `d2` command as a person meets it: its help, its flags, tables given by flags, and what it says at work."""
 
 import json
 import shutil
@@ -11,6 +11,7 @@ import pytest
 from command_lines import form_of
 from stand_in_recordings import renamed
 
+from d2_plugin import progress
 from d2_plugin.commands.arguments.form import Given
 from d2_plugin.commands.cli import COMMANDS, main
 from d2_plugin.config import DensifyConfig
@@ -116,3 +117,17 @@ def test_a_preset_passes_over_a_camera_without_calibration_and_so_does_the_run(
     assert (metrics["train_cameras"], metrics["test_cameras"]) == (["cam01", "cam13"], ["cam10", "cam00"])
     assert main(["plan", str(room), "--train-cameras", "cam01,cam13"]) == 2  # no preset: whatever does not fit is named
     assert "cam07" in capsys.readouterr().err
+
+
+def test_the_time_left_is_that_of_the_work_not_of_what_began_it(monkeypatch, capsys) -> None:
+    """Workers that take 40 s to start, then a unit a second: 65 s are left for 65 units, not five minutes."""
+    now = 0.0
+    monkeypatch.setattr(progress.time, "monotonic", lambda: now)
+    monkeypatch.setattr(progress, "_silent", False)
+    with progress.progress_bar("between", 76) as bar:
+        for done in range(1, 77):
+            now = 39.0 + done
+            bar.update(done)
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[:2] == ["between: 1/76 ", "between: 11/76, 65 s left "]
+    assert lines[-1] == "between: 76/76, 0 s left "

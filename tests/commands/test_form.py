@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import pytest
+from refusals import refuses
 
 from d2_plugin.commands.arguments.form import Form, Given, Group
 from d2_plugin.commands.arguments.help import help_text
-from d2_plugin.errors import D2Error
 from d2_plugin.settings import Positional, Range, Settings, Share, Steps, declared
 
 
@@ -142,13 +142,10 @@ class TestMistakes:
         ],
     )
     def test_each_is_one_sentence_that_names_the_flag(self, kind: type, words: list[str], message: str) -> None:
-        with pytest.raises(D2Error, match=message) as caught:
-            given(*words, kind=kind)
-        assert len(str(caught.value).splitlines()) == 1
+        refuses(message, given, *words, kind=kind)
 
     def test_what_is_missing_is_named_all_at_once(self) -> None:
-        with pytest.raises(D2Error, match="d2 work needs PLACE and --output"):
-            form_of().parse([])
+        refuses("d2 work needs PLACE and --output", form_of().parse, [])
 
 
 class TestHelp:

@@ -72,16 +72,14 @@ def training(
     gaussians: GaussianModel, deform: DeformModel, scene: inria.Scene, opt=None, checkpoint=None, stop: int = 10**9
 ) -> SimpleNamespace:
     """The repository saves no optimizer, so `checkpoint` is what one would add to resume at all."""
-    opt, dataset, first_iter = opt or default_options(), SimpleNamespace(white_background=False), 0
+    opt, dataset = opt or default_options(), SimpleNamespace(white_background=False)
+    (model_params, deform_params), first_iter = checkpoint or (({}, {}), 0)
     deform.train_setting(opt)
-    if checkpoint:
-        (model_params, deform_params), first_iter = checkpoint
-        restore(deform, deform_params)
-        gaussians.restore(model_params, opt)  # as many Gaussians as there were, before anything attaches
+    restore(deform, deform_params)
+    gaussians.restore(model_params, opt)  # as many Gaussians as there were, before anything attaches
     gaussians.training_setup(opt)
 
-    if checkpoint:
-        gaussians.restore(model_params, opt)
+    gaussians.restore(model_params, opt)
     bg_color = [1, 1, 1] if dataset.white_background else [0, 0, 0]
     for iteration in range(first_iter + 1, min(opt.iterations, stop) + 1):
         torch.manual_seed(iteration)

@@ -82,14 +82,11 @@ def make() -> tuple[GaussianModel, Scene]:
 
 def training(gaussians: GaussianModel, scene: Scene, opt=None, checkpoint=None, stop: int = 10**9) -> SimpleNamespace:
     opt, dataset = opt or default_options(), SimpleNamespace(white_background=False)
-    first_iter, duration = 0, 2
-    if checkpoint:
-        (model_params, first_iter) = checkpoint
-        gaussians.restore(model_params, opt)  # as many Gaussians as there were, before anything attaches
+    duration, (model_params, first_iter) = 2, checkpoint or ({}, 0)
+    gaussians.restore(model_params, opt)  # as many Gaussians as there were, before anything attaches
     gaussians.training_setup(opt)
 
-    if checkpoint:
-        gaussians.restore(model_params, opt)
+    gaussians.restore(model_params, opt)
     bg_color = [1, 1, 1] if dataset.white_background else [0, 0, 0]
     cameras = scene.getTrainCameras()
     traincamdict = {i: [cam for cam in cameras if cam.timestamp == i / duration] for i in range(duration)}

@@ -17,6 +17,7 @@ from calibration_writers import CASES as CALIBRATIONS
 from calibration_writers import rig
 from fuzzing import SEED, bounded_memory, expect_result_or_sentence, leaves, mutate_file
 from prior_cases import write_dense_array
+from recorded import write_video
 from small_layouts import small_recording, write_layout
 from tiny_onnx import mean_network
 
@@ -99,11 +100,8 @@ def some_rows() -> list[str]:
     return [line for lines in found.values() for line in lines[:2]]
 
 
-def write_video(path: Path) -> None:
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), 24, (48, 32))
-    for _ in range(3):
-        writer.write(IMAGE)
-    writer.release()
+def write_three_images(path: Path) -> None:
+    write_video(path, [IMAGE] * 3, [0, 1 / 24, 2 / 24])
 
 
 def write_camera_path(path: Path) -> None:
@@ -158,7 +156,7 @@ CASES = {
     "npz": Case("a.npz", lambda p: np.savez_compressed(p, depth=MAP), lambda p: read_array(p, key="depth")),
     "png": Case("a.png", lambda p: write_png(p, IMAGE), lambda p: (image_size(p), read_image(p))),
     "jpeg": Case("a.jpg", lambda p: cv2.imwrite(str(p), IMAGE), lambda p: (image_size(p), read_image(p))),
-    "video": Case("a.mp4", write_video, lambda p: VideoFrames({"a": read_video(p)}).image("a", 1)),
+    "video": Case("a.mp4", write_three_images, lambda p: VideoFrames({"a": read_video(p)}).image("a", 1)),
     "dense": Case("a.bin", lambda p: write_dense_array(p, MAP), read_dense_array),
     "sensor json": Case("depth.json", write_sensor, sensor),
     "sensor npy": Case("depth/cam00/0.npy", write_sensor, sensor),

@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 import pytest
 from refusals import refuses
-from small_layouts import write_layout
 
 from d2_plugin.cache import Untrusted, cache_folder, check_private
 from d2_plugin.commands import cli
@@ -45,29 +44,24 @@ pytest.importorskip("cv2", reason="opencv is in the `image` extra")
 Refused = Callable[..., str]
 
 
-@pytest.fixture(scope="module")
-def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_layout("folder", tmp_path_factory.mktemp("doors") / "small")
-
-
-def test_a_mistyped_prior_is_not_built_nor_nothing_compared(recording: Path, tmp_path: Path, refused: Refused) -> None:
-    words = ["train", recording, "--train-cameras", "cam00,cam01", "--output", tmp_path / "run"]
+def test_a_mistyped_prior_is_not_built_nor_nothing_compared(small: Path, tmp_path: Path, refused: Refused) -> None:
+    words = ["train", small, "--train-cameras", "cam00,cam01", "--output", tmp_path / "run"]
     assert "no depth priors at" in refused(*words, "--priors", tmp_path / "typo")
     assert "no run is given" in refused("compare", "")
     assert not list(tmp_path.iterdir())
 
 
-def test_nothing_is_written_inside_the_images_of_a_recording(recording: Path, tmp_path: Path, refused: Refused) -> None:
-    (tmp_path / "room").symlink_to(recording)
-    images = recording / "images"
+def test_nothing_is_written_inside_the_images_of_a_recording(small: Path, tmp_path: Path, refused: Refused) -> None:
+    (tmp_path / "room").symlink_to(small)
+    images = small / "images"
     before = {path: path.stat().st_mtime_ns for path in images.rglob("*")}
     for place in (images, images / "cam00", images / "zz", tmp_path / "room" / "images" / "zz" / "deeper"):
         of_two, run = ["--train-cameras", "cam00,cam01"], tmp_path / "run"
         for words in (
-            ["train", recording, *of_two], ["priors", recording, *of_two], ["ablate", recording, *of_two], ["demo"],
+            ["train", small, *of_two], ["priors", small, *of_two], ["ablate", small, *of_two], ["demo"],
             ["report", run], ["export", run], ["export", run, "--format", "ply"], ["render", run],
-            ["export-recording", recording, "--format", "n3dv"], ["import", run, "--calibration", "x"],
-            ["bench", "training", f"{recording}@cam00+cam01"],
+            ["export-recording", small, "--format", "n3dv"], ["import", run, "--calibration", "x"],
+            ["bench", "training", f"{small}@cam00+cam01"],
         ):  # fmt: skip
             assert "where every folder is a camera" in refused(*words, "--output", place)
         assert "where every folder is a camera" in refused("compare", run, "--page", place / "deep.html")
@@ -122,19 +116,19 @@ def test_a_cache_that_cannot_be_is_one_sentence(monkeypatch: pytest.MonkeyPatch)
     assert "delete" not in str(refusal.value)
 
 
-def test_links_in_a_circle_pipes_and_devices_are_one_sentence(recording: Path, tmp_path, refused: Refused) -> None:
+def test_links_in_a_circle_pipes_and_devices_are_one_sentence(small: Path, tmp_path, refused: Refused) -> None:
     pytest.importorskip("av")
     (tmp_path / "videos").mkdir()
     loop, video = tmp_path / "loop", tmp_path / "videos" / "cam00.mp4"
     loop.symlink_to(loop)
-    calibration = ["--calibration", recording / "cameras.json"]
+    calibration = ["--calibration", small / "cameras.json"]
     for place in (lambda: video.symlink_to(loop), lambda: os.mkfifo(video), lambda: video.symlink_to("/dev/zero")):
         place()
         refused("import", tmp_path / "videos", *calibration, "--output", tmp_path / "out")
         video.unlink()
     refused("import", tmp_path / "loop", *calibration, "--output", tmp_path / "out")
-    refused("train", recording, "--train-cameras", "cam00", "--output", tmp_path / "loop")
-    refused("export-recording", recording, "--format", "n3dv", "--output", tmp_path / "loop")
+    refused("train", small, "--train-cameras", "cam00", "--output", tmp_path / "loop")
+    refused("export-recording", small, "--format", "n3dv", "--output", tmp_path / "loop")
 
 
 def test_what_a_folder_of_videos_leaves_out_is_named(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -275,8 +269,8 @@ def answer(call: Call, wrong: Any) -> str:
     return "accepted"
 
 
-def test_what_is_no_path_recording_camera_frame_or_image(recording: Path) -> None:
-    calls = {call.__qualname__: call for call in TAKE_A_PATH} | of_a_recording(recording, open_recording(recording))
+def test_what_is_no_path_recording_camera_frame_or_image(small: Path) -> None:
+    calls = {call.__qualname__: call for call in TAKE_A_PATH} | of_a_recording(small, open_recording(small))
     found = {(name, str(w)): answer(call, w) for name, call in calls.items() for w in WRONG}
     assert {case: why for case, why in found.items() if why} == {}
 

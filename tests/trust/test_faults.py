@@ -3,22 +3,12 @@
 import errno
 import random
 import shutil
-from multiprocessing.connection import wait
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import pytest
-from trust_commands import (
-    FAIL_FROM,
-    FAIL_ONCE,
-    KILL_AFTER_RENAME,
-    KILL_BEFORE_RENAME,
-    Ended,
-    Fault,
-    Started,
-    contents,
-    killed,
-)
+from trust_commands import FAIL_FROM, FAIL_ONCE, KILL_AFTER_RENAME, KILL_BEFORE_RENAME, Fault, contents, killed
 
 from d2_plugin.store.store import PriorStore
 
@@ -145,70 +135,55 @@ def test_builds_of_one_store_and_runs_on_it_side_by_side_are_whole_and_alike(wor
 
 SEEDS = 200
 
-AT_ONCE = 3
+
+def a_run(place: Any, seed: int) -> list[str]:
+    """Of the runs that differ by their seed, all on one store; the last of two flags counts."""
+    folder = place.folder / "day"
+    own = ["--iterations", "3", "--seed", str(seed), "--priors", str(folder / "priors")]
+    return [*place.work["train"].words, *own, "--output", str(folder / f"run{seed}")]
 
 
-class Day:
-    """Runs that differ by their seed, all on one store, of which some are killed, and some are started twice."""
+def goes_on_until_none_is_left(place: Any, store: Path, left: set[int], draw: random.Random) -> int:
+    """Start runs, of which some are killed, and some are started twice, until all have scores; returns the kills.
 
-    def __init__(self, place: Any, draw: random.Random) -> None:
-        self.place, self.draw = place, draw
-        self.folder = place.folder / "day"
-        self.store = self.folder / "priors"
-        self.open = set(range(SEEDS))
-        self.kills = 0
-
-    def run(self, seed: int) -> list[str]:
-        """The last of two flags counts."""
-        own = ["--iterations", "3", "--seed", str(seed), "--priors", str(self.store)]
-        return [*self.place.work["train"].words, *own, "--output", str(self.folder / f"run{seed}")]
-
-    def next(self, seed: int) -> list[str]:
-        """Mostly a run; now and then a build of the priors that it shares with the others, or of fewer cameras."""
-        chance = self.draw.random()
-        if chance > 0.1 and (self.store / "store.json").is_file():
-            return self.run(seed)
-        cameras = "train0,train1" if chance > 0.05 else "train1"
-        return [*self.place.work["priors"].words, "--train-cameras", cameras, "--output", str(self.store)]
-
-    def live(self) -> None:
-        running: dict[Started, int] = {}
-        while self.open or running:
-            while len(running) < AT_ONCE and (self.open or not running):
-                seed = self.draw.choice(sorted(self.open))
-                limit = None if self.draw.random() < 0.6 else self.draw.uniform(0, self.place.cpu["train"])
-                running[self.place.commands.start(self.next(seed), kill_after=limit)] = seed
-            wait([started.process.sentinel for started in running])
-            for started in [each for each in running if not each.process.is_alive()]:
-                self.ended(running.pop(started), started.end())
-
-    def ended(self, seed: int, ended: Ended) -> None:
-        self.kills += killed(ended)
+    Now and then it is a build of the priors that they share, or of fewer cameras."""
+    kills = 0
+    while seeds := sorted(left):
+        seed, chance = draw.choice(seeds), draw.random()
+        words = a_run(place, seed)
+        if chance < 0.1 or not (store / "store.json").is_file():
+            cameras = "train0,train1" if chance > 0.05 else "train1"
+            words = [*place.work["priors"].words, "--train-cameras", cameras, "--output", str(store)]
+        limit = None if draw.random() < 0.6 else draw.uniform(0, place.cpu["train"])
+        ended = place.commands.run(words, kill_after=limit)
+        kills += killed(ended)
         if ended.code == 2:
             assert "another process is writing" in ended.refusal, ended.said
         elif not killed(ended):
             assert ended.code == 0, ended.said
             if "PSNR" in ended.said:
-                self.open.discard(seed)
+                left.discard(seed)
+    return kills
 
 
 @pytest.mark.slow
 def test_two_hundred_runs_started_killed_and_continued_by_three_processes(workplace: Any) -> None:
-    day = Day(workplace, random.Random(SEEDS))
-    day.live()
-    is_whole(workplace, day.store)
-    for folder in [day.store, *(day.store / "cameras").glob("*")]:
-        store = PriorStore.open(folder)
-        for camera in store.cameras:
-            for frame in store.frames:
-                store.prior(camera, frame)  # compares every checksum
-    for seed in range(SEEDS):
-        assert (day.folder / f"run{seed}" / "metrics.json").is_file()
-    for seed in day.draw.sample(range(SEEDS), 20):
-        folder = day.folder / f"run{seed}"
-        found = contents(folder)
-        shutil.rmtree(folder)
-        ended = workplace.commands.run(day.run(seed))
+    folder, left = workplace.folder / "day", set(range(SEEDS))
+    store = folder / "priors"
+    with ThreadPoolExecutor(3) as threads:
+        draws = [random.Random(f"{SEEDS} {number}") for number in range(3)]
+        kills = sum(threads.map(lambda draw: goes_on_until_none_is_left(workplace, store, left, draw), draws))
+    assert kills > SEEDS // 5
+    is_whole(workplace, store)
+    for built in [store, *(store / "cameras").glob("*")]:
+        opened = PriorStore.open(built)
+        for camera in opened.cameras:
+            for frame in opened.frames:
+                opened.prior(camera, frame)  # compares every checksum
+    assert all((folder / f"run{seed}" / "metrics.json").is_file() for seed in range(SEEDS))
+    for seed in random.Random(SEEDS).sample(range(SEEDS), SEEDS // 10):
+        found = contents(folder / f"run{seed}")
+        shutil.rmtree(folder / f"run{seed}")
+        ended = workplace.commands.run(a_run(workplace, seed))
         assert ended.code == 0, ended.said
-        assert found == contents(folder)
-    assert day.kills > SEEDS // 5
+        assert found == contents(folder / f"run{seed}")
