@@ -18,7 +18,7 @@ VARIANTS: tuple[Variant, ...] = get_args(Variant)
 EPSILON = 1e-9
 """The paper's eps, world units."""
 CONFIRMS, NEAR = 2.0, 0.1
-"""A map confirms a match that the tests refuse within so many of its sigmas and within this relative difference."""
+"""A map confirms a match that no other view does within so many of its sigmas and within this relative difference."""
 SURER, SUREST = 0.25, 0.005
 """Sigma of such a match: this share of the map's and of how far the two are apart, and no less than that."""
 
@@ -110,11 +110,11 @@ def fuse(
 
 
 def with_matches(maps: FusedPrior, mono: np.ndarray, sigma: np.ndarray, unconfirmed: np.ndarray) -> FusedPrior:
-    """D* with the matches that the monocular map confirms, not the tests of stereo; an addition to the paper.
+    """D* with the matches that the monocular map confirms where no other view does; an addition to the paper.
 
     A match (all maps are float [H, W], depths 0 where there is none) near `mono` is verified, as the paper has it, and
     takes the place of the map's depth, which is not as exact, or of nothing, at an edge that the map blurs. Its sigma
-    says that it passed fewer tests: a share of the relative `sigma` of the map and of how far the two are apart.
+    says that it had one witness: a share of the relative `sigma` of the map and of how far the two are apart.
     """
     known = (mono > 0) & (unconfirmed > 0) & (sigma < np.inf)
     apart = np.abs(np.log(np.where(known, unconfirmed, 1) / np.where(known, mono, 1)))

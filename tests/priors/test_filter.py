@@ -67,19 +67,6 @@ def test_random_depth_leaves_nearly_nothing(recording: Recording) -> None:
         assert (result.unconfirmed > 0).mean() < 0.001
 
 
-def test_a_match_among_wrong_ones_may_be_confirmed_by_a_map_where_another_view_has_it_too(recording: Recording) -> None:
-    """Where .6 of all depths are drawn at random, too few neighbours are on one surface for the tests."""
-    grays, cameras, depths, costs = views(recording)
-    rng = np.random.default_rng(0)
-    torn = [np.where(rng.random(z.shape) < 0.4, z, rng.uniform(2, 8, z.shape)).astype(np.float32) for z in depths]
-    for result, depth in zip(filter_depths(grays, cameras, torn, costs, SETTINGS), depths):
-        found = result.unconfirmed > 0
-        assert found.mean() > 0.08
-        assert np.quantile(np.abs(result.unconfirmed[found] / depth[found] - 1), 0.98) < 0.01
-    nobody_else = [torn[0], np.zeros_like(torn[1]), np.zeros_like(torn[2])]
-    assert (filter_depths(grays, cameras, nobody_else, costs, SETTINGS)[0].unconfirmed > 0).mean() < 0.05
-
-
 def test_bad_matches_are_dropped(recording: Recording) -> None:
     grays, cameras, depths, costs = views(recording)
     costs[0] = np.full_like(costs[0], 0.51)

@@ -29,9 +29,8 @@ TEXTURE_MIN = 0.005
 any texture are refused, because coherence tells wrong matches better; OpenMVS, without it, asks for .02."""
 COHERENCE_MIN = 0.57
 """A depth survives when this share of its neighbours lies on its tangent plane."""
-PLAUSIBLE, WITNESSED = 0.5, 0.2
-"""From this share on a match that the tests refuse may still be confirmed by a network's map; from the second on where
-a match of another view, before any of these tests, agrees with it."""
+PLAUSIBLE = 0.5
+"""From this share on a match that other views do not confirm may still be confirmed by a network's map."""
 REACH = 9
 """Half the side of the square window of coherence, pixels, a multiple of `STRIDE`."""
 CONTRAST = 0.05
@@ -51,7 +50,7 @@ class GeometricDepth:
 
     `depth` [H, W] float32 is planar z, 0 where nothing survived (the complement of Omega^g); `sigma` [H, W] float32 is
     its relative standard deviation, infinite where there is none; `unconfirmed` [H, W] float32 are matches elsewhere
-    that a network's map may still confirm, 0 where there is none; `record` is what is stored beside them, as plain
+    that lack the word of another view alone, 0 where there is none; `record` is what is stored beside them, as plain
     values: under `survivors` how many pixels were left after each test, in order.
     """
 
@@ -103,9 +102,7 @@ def filter_depths(
         }
         evidence = (coherent[index], confirmation.parallax, confirmation.spread, grey_gradient(gray))
         sigma = geometric_sigma(final, *evidence)
-        witnessed = confirm(index, cameras, textured, settings, tolerance).sources > 0
-        least = np.where(witnessed, WITNESSED, PLAUSIBLE)
-        unconfirmed = textured[index] * ((coherent[index] >= least) & (final == 0))
+        unconfirmed = textured[index] * ((coherent[index] >= PLAUSIBLE) & (final == 0))
         results.append(GeometricDepth(final, sigma, unconfirmed, {"survivors": survivors}))
     return results
 
