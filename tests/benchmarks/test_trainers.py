@@ -1,24 +1,20 @@
-"""The bench of the official trainers: its table from rows, what it asks each script for, and one run of a mimic."""
+"""The bench of the official trainers: its table, what moves and what lies between, and each official script."""
 
-import json
 import os
 import sys
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
-from mimics.workplace import furnish
 
 from benchmarks.trainers import between
 from benchmarks.trainers.bench import TrainersBench, rows_of, run
 from benchmarks.trainers.moving import Moving, save_truth
 from benchmarks.trainers.page import read_rows, replaced, table
-from benchmarks.trainers.prepare import Prepared, Source
-from benchmarks.trainers.trials import TRIALS, Trial
+from benchmarks.trainers.trials import TRIALS
 from d2_plugin.errors import D2Error
 from d2_plugin.protocol import View
 from d2_plugin.recordings import open_recording
@@ -81,74 +77,6 @@ def test_instants_between_are_asked_for_in_the_trainers_own_time(
 def test_a_trainer_whose_time_is_not_known_is_not_asked_between(tmp_path: Path) -> None:
     with pytest.raises(D2Error, match="gsplat is not scored between instants: give --only fudan, hust4d, spacetime"):
         list(rows_of("gsplat", TrainersBench(tmp_path, (tmp_path,), hold_out_instants=2)))
-
-
-TRAIN = """
-import no_dynamo
-from gaussian_renderer import render
-from scene import Scene
-from scene.gaussian_model import GaussianModel
-from mimics import fudan
-from mimics.inria import cameras_of, default_options, initial_points
-
-fudan.render = render
-gaussians = GaussianModel()
-gaussians.create_from_pcd(*initial_points())
-scene = Scene(cameras_of(timestamp=lambda view: view.time))
-fudan.training(gaussians, scene, default_options(iterations=10, densify_until_iter=0))
-print("[ITER 10] Evaluating test: L1 0.1 PSNR 20.125")
-"""
-
-
-@pytest.fixture
-def checkout(tmp_path: Path) -> Path:
-    """fudan's modules in small."""
-    folder = tmp_path / "checkouts" / "4d-gaussian-splatting"
-    for name, text in {
-        "utils/image_utils.py": "def psnr(image, truth): return None\n",
-        "scene/__init__.py": "from mimics import fudan\nclass Scene(fudan.Scene): pass\n",
-        "scene/gaussian_model.py": "from mimics import fudan\nclass GaussianModel(fudan.GaussianModel): pass\n",
-        "gaussian_renderer/__init__.py": "from mimics.fudan import render\n",
-        "train.py": TRAIN,
-    }.items():
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        (folder / name).write_text(text)
-    return folder
-
-
-def test_a_trainer_runs_in_its_own_process_and_leaves_rows_and_a_table(checkout: Path, tmp_path, monkeypatch) -> None:
-    prior, truth = furnish(tmp_path, monkeypatch) / "prior", true_images(tmp_path)
-
-    def prepared(source: Source, trial: Trial, work: Path) -> Prepared:
-        return Prepared(source, tmp_path, None, prior, truth)
-
-    monkeypatch.setattr("benchmarks.trainers.bench.prepare", prepared)
-    monkeypatch.setattr(Source, "seconds", 0.1)
-    monkeypatch.setenv("PYTHONPATH", f"{TESTS.parent}{os.pathsep}{TESTS}")
-    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
-    page = tmp_path / "page.md"
-    page.write_text("<!-- rows -->\n<!-- end -->\n")
-    settings = TrainersBench(
-        checkout.parent, (tmp_path / "tiny",), only=("fudan", "4c4d"), methods=("bare", "no hooks"), iterations=10,
-        work=tmp_path / "work", output=tmp_path / "rows.jsonl", page=page,
-    )  # fmt: skip
-    text = run(settings)
-    bare, without = read_rows(settings.output)
-    assert bare["failed"] is None, bare["failed"]
-    assert bare["psnr"] == without["psnr"] == {"10": 20.125}
-    assert bare["digest"] == without["digest"]
-    assert bare["gaussians"] == 60
-    assert bare["psnr_moving"] is None, "this script compares nothing"
-    assert "command" in bare
-    assert str(tmp_path) not in json.dumps(bare), "no path of this machine"
-    assert "| fudan | tiny | 10 | 20.12 | the same bits |" in page.read_text()
-    assert "4c4d: no folder 4C4D, left out" in text
-    (tmp_path / "python").write_text("#!/bin/sh\necho no luck; exit 1\n")
-    (tmp_path / "python").chmod(0o755)
-    monkeypatch.setattr(sys, "executable", str(tmp_path / "python"))
-    run(replace(settings, methods=("bare",)))
-    (failed,) = [row for row in read_rows(settings.output) if row["method"] == "bare"]
-    assert failed["failed"] == "ended with code 1: no luck"
 
 
 CHECKOUTS = os.environ.get("D2_CHECKOUTS")
