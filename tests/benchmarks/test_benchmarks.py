@@ -7,18 +7,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
+from prior_cases import showing
 
 from benchmarks import memory, scaling
 from benchmarks.__main__ import PARTS, main
 from benchmarks.align_measure import TRUE_LINE, AlignMethod, align_problem, methods
 from benchmarks.gpu import proof as gpu
 from benchmarks.never_worse.maps import SPOILED, Spoiled, spoiled_recording
-from benchmarks.priors import PriorsBench, cases
+from benchmarks.priors import PriorsBench
 from benchmarks.priors import run as run_priors
-from benchmarks.priors_section import DIAGONAL, priors
+from benchmarks.priors_section import priors
 from benchmarks.report import EVERY
-from benchmarks.stability.gaussians import difference, random_rotation, random_scene, render, turned
 from benchmarks.stability.sweep import run_sweeps
 from benchmarks.stereo_measure import score
 from benchmarks.work_precision import means, work_precision
@@ -26,7 +25,6 @@ from d2_plugin.commands.cli import main as d2
 from d2_plugin.priors.declared_error import NORMAL_SHARE, frames_with_truth, reliability_curve
 from d2_plugin.priors.settings import PriorSettings
 from d2_plugin.recordings import open_recording
-from d2_plugin.recordings.export.folder import save_recording
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.runs.report.report import BUILDERS, make_report
 from d2_plugin.runs.rows import Row, make_row, read_rows
@@ -118,16 +116,9 @@ def test_every_method_finds_the_line_when_nothing_is_wrong(method: AlignMethod, 
 def test_nothing_fails_and_only_what_float32_cannot_hold_is_a_gap() -> None:
     rows = run_sweeps()
     assert [row for row in rows if row["verdict"] == "failure"] == []
-    for row in (row for row in rows if row["verdict"] == "gap"):
-        assert (row["method"], row["case"]) == ("float32", "world offset")
-        assert row["value"] > 100, "from there on float32 cannot hold the scene, which the report shows as a gap"
-
-
-def test_a_scene_that_is_another_one_is_seen_to_differ() -> None:
-    scene = random_scene()
-    image = render(scene, torch.float64)
-    assert difference(render(turned(scene, random_rotation(3)), torch.float64), image) < 1e-12
-    assert difference(render(scene._replace(means=scene.means + 1e-3), torch.float64), image) > 1e-4
+    gaps = [row for row in rows if row["verdict"] == "gap"]
+    assert {(row["method"], row["case"]) for row in gaps} == {("float32", "world offset")}, "another scene is seen"
+    assert min(row["value"] for row in gaps) > 100, "from there on float32 cannot hold the scene"
 
 
 def test_scores_count_what_they_say() -> None:
@@ -188,32 +179,23 @@ def test_a_rendered_rig_is_measured_without_any_data_and_drawn(tmp_path: Path) -
     make_report(rows, tmp_path, builders={"priors": priors})
     svg, text = (tmp_path / "priors.svg").read_text(), (tmp_path / "report.md").read_text()
     assert svg.count(" pixels</title>") == sum(len(row["curve"]) for row in labels) > 0
-    assert DIAGONAL in svg
-    assert "true error, 68 % quantile" in svg
     assert "| synthetic4, 4 views | mono only |" in text
     assert "emulated, not predicted" in text
     assert "What moves: scene flow, and what lies between two instants" in text
 
 
-def test_frames_with_truth_are_those_of_any_of_the_cameras(tmp_path: Path) -> None:
-    folder = save_recording(synthetic_recording(2, held_out=0, frames=3, width=96, height=54), tmp_path / "den")
-    for depth in folder.glob("depth/*/00001.*"):
-        depth.unlink()
-    recording = cases(PriorsBench((str(folder),)))[0].recording
-    assert frames_with_truth(recording, ["train0"]) == [0, 2]
+def test_frames_with_truth_are_those_of_any_of_the_cameras() -> None:
+    whole = synthetic_recording(1, held_out=0, frames=10, width=16, height=9)
+    recording = showing(whole, {"depth": lambda name, frame: None if frame == 9 else whole.depth(name, frame)})
+    assert frames_with_truth(recording, ["train0"]) == list(range(9))
     assert frames_with_truth(recording, []) == []
-    long = synthetic_recording(1, held_out=0, frames=9, width=16, height=9)
-    assert frames_with_truth(long, ["train0"], most=3) == [0, 4, 8], "spread over the recording"
-    assert frames_with_truth(long, ["train0"], most=9) == list(range(9))
-
-
-@pytest.fixture(scope="module")
-def room(saved_room: Callable[..., Path]) -> Path:
-    return saved_room(cameras=2, held_out=1, frames=2, width=96, height=54, arc_degrees=15)
+    assert frames_with_truth(recording, ["train0"], most=3) == [0, 4, 8], "spread over the recording"
+    assert frames_with_truth(recording, ["train0"], most=9) == list(range(9))
 
 
 @pytest.mark.parametrize("kind", SPOILED)
-def test_a_spoiled_recording_differs_in_its_maps_alone(room: Path, tmp_path: Path, kind: Spoiled) -> None:
+def test_a_spoiled_recording_differs_in_its_maps_alone(saved_room: Callable, tmp_path: Path, kind: Spoiled) -> None:
+    room = saved_room(cameras=2, held_out=1, frames=2, width=96, height=54, arc_degrees=15)
     before = open_recording(room)
     cameras = list(before.cameras)[:2]
     after = open_recording(spoiled_recording(room, cameras, None, kind, tmp_path, PriorSettings()))

@@ -20,11 +20,9 @@ from d2_plugin.protocol import View
 from d2_plugin.recordings import open_recording
 from d2_plugin.viewing.rendering import RenderedView
 
-TESTS = Path(__file__).parents[1]
-
 
 def test_the_rows_of_the_page_are_read_and_its_tables_made_of_them() -> None:
-    page = TESTS.parent / "docs" / "results" / "attach.md"
+    page = Path(__file__).parents[2] / "docs" / "results" / "attach.md"
     text = page.read_text()
     assert replaced(text, table(read_rows(page.with_suffix("") / "rows.jsonl")), "") == text
 

@@ -131,10 +131,10 @@ def test_a_real_rig_with_neighbours_up_to_42_degrees_apart_is_settled(shared_dat
     assert worst(rig.cameras, dome.cameras)[0] < 0.2
 
 
-def blind(cameras: dict[str, Camera]) -> dict[str, Camera]:
-    """The cameras with a focal length that is far off."""
+def with_focal(cameras: dict[str, Camera], focal: float) -> dict[str, Camera]:
+    """The cameras with a focal length of so many pixels, straight behind the middle of the image."""
     return {
-        name: replace(camera, K=pinhole(300, 300, camera.width / 2, camera.height / 2))
+        name: replace(camera, K=pinhole(focal, focal, camera.width / 2, camera.height / 2))
         for name, camera in cameras.items()
     }
 
@@ -144,11 +144,8 @@ class TestFocalLengths:
 
     @pytest.mark.parametrize("focal", ["shared", pytest.param("each", marks=pytest.mark.slow)])
     def test_are_found_with_the_poses(self, focal: str) -> None:
-        truth = {
-            name: replace(camera, K=pinhole(600, 600, camera.width / 2, camera.height / 2))
-            for name, camera in arc().items()
-        }
-        rig = solve_features(seen_by(truth, things=120), blind(truth), tuple(truth), focal=focal)
+        truth = with_focal(arc(), 600)
+        rig = solve_features(seen_by(truth, things=120), with_focal(truth, 300), tuple(truth), focal=focal)
         for name, camera in rig.cameras.items():
             assert camera.K[0, 0] == pytest.approx(600, rel=0.01)
             assert abs(np.log(camera.K[0, 0] / 600)) < max(2 * rig.focals[name], 0.004)
@@ -165,10 +162,11 @@ class TestFocalLengths:
 
     def test_that_the_images_do_not_tell_are_refused(self) -> None:
         truth = arc(3, 4.0)  # hardly any angle: focal length and depth change places
+        blind = with_focal(truth, 300)
         with pytest.raises(D2Error, match=r"two halves of the images disagree about|do not settle"):
-            solve_features(seen_by(truth, things=60), blind(truth), tuple(truth), focal="each")
+            solve_features(seen_by(truth, things=60), blind, tuple(truth), focal="each")
         with pytest.raises(D2Error, match="c0 shares nothing with the others"):
-            solve_features(seen_by(truth, things=6, wrong=1.0), blind(truth), tuple(truth), focal="shared")
+            solve_features(seen_by(truth, things=6, wrong=1.0), blind, tuple(truth), focal="shared")
 
 
 class TestBoards:

@@ -118,18 +118,13 @@ class TestUndistortion:
 class TestLoss:
     """Weights in the photometric loss."""
 
-    @staticmethod
-    def images(dtype: torch.dtype = torch.float32) -> tuple[torch.Tensor, torch.Tensor]:
-        generator = torch.Generator().manual_seed(3)
-        return tuple(torch.rand(24, 20, 3, generator=generator, dtype=dtype) for _ in range(2))  # type: ignore[return-value]
-
     def test_weights_of_one_change_nothing(self) -> None:
-        image, target = self.images(torch.float64)
+        image, target = torch.rand(2, 24, 20, 3, generator=torch.Generator().manual_seed(3)).double()
         expected = photometric_loss(image, target)
         torch.testing.assert_close(weighted_photometric_loss(image, target, 0.2, torch.ones(24, 20)), expected)
 
     def test_pixels_of_no_weight_pull_nothing_and_may_hold_anything(self) -> None:
-        image, target = self.images()
+        image, target = torch.rand(2, 24, 20, 3, generator=torch.Generator().manual_seed(3))
         weights = torch.ones(24, 20)
         weights[:, 12:] = 0
         other = torch.where(weights[..., None] > 0, target, torch.zeros(()))

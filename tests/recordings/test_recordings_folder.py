@@ -142,7 +142,8 @@ def test_images_of_two_sizes_are_refused_when_read(folder: Path) -> None:
     [
         ({"fx": float("nan")}, "cameras.json is not JSON .*NaN, which is not finite"),
         ({"fy": -3.0}, "focal lengths"),
-        ({"R": [[1, 0, 0], [0, 1, 0], [0, 0, -1]]}, "no rotation"),
+        ({"R": [[1, 0, 0], [0, 1, 0], [0, 0, -1]]}, r"camera train0 .* an R that is no rotation \(orthonormal rows"),
+        ({"R": [[1.01, 0, 0], [0, 1.01, 0], [0, 0, 1.01]]}, "no rotation"),
         ({"R": [[1, 0], [0, 1]]}, "cannot be understood"),
         ({"width": 0}, "at least one pixel"),
         ({"name": "train1"}, "camera train1 twice"),

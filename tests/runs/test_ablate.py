@@ -8,8 +8,6 @@ from at_once import measured_at_once
 from refusals import refuses
 
 from d2_plugin.commands.cli import main
-from d2_plugin.recordings.export.folder import save_recording
-from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.runs.ablation.ablate import order_table, report, table
 from d2_plugin.runs.ablation.presets import PRESETS, TABLES, rows_named
 from d2_plugin.runs.settings import RunSettings, check
@@ -83,12 +81,10 @@ class TestTables:
         assert "holds" not in text.replace(EXPLANATION, "")
 
 
-def test_the_command_trains_shares_priors_and_repeats_nothing(tmp_path: Path, capsys, refused) -> None:
+def test_the_command_trains_shares_priors_and_repeats_nothing(saved_room, tmp_path: Path, refused) -> None:
     pytest.importorskip("pycolmap", reason="pycolmap is in the `stereo` extra")
-    pytest.importorskip("cv2", reason="opencv is in the `image` extra")
-    recording = synthetic_recording(cameras=2, held_out=1, frames=2, width=96, height=54)
-    path = save_recording(recording, tmp_path / "recordings" / "room")
-    command = ["ablate", str(path), "--train-cameras", "train0,train1", "--rows", "main,no_pruning"]
+    room = saved_room(cameras=2, held_out=1, frames=2, width=96, height=54)
+    command = ["ablate", str(room), "--train-cameras", "train0,train1", "--rows", "main,no_pruning"]
     command += ["--seeds", "3", "--iterations", "8", "--jobs", "1", "--output", str(tmp_path / "out")]
     with measured_at_once():
         assert main(command) == 0
@@ -105,5 +101,4 @@ def test_the_command_trains_shares_priors_and_repeats_nothing(tmp_path: Path, ca
     with measured_at_once():
         assert main(command) == 0
     assert {path: path.stat().st_mtime_ns for path in checkpoints} == checkpoints
-    capsys.readouterr()
     assert "another run" in refused(*command, "--iterations", "9")

@@ -20,16 +20,12 @@ from d2_plugin.runs import metrics
 from d2_plugin.runs.lpips import find_lpips
 
 
-def sine_pair() -> tuple[np.ndarray, np.ndarray]:
+def sine_pair() -> tuple[torch.Tensor, torch.Tensor]:
+    """Waves [H, W, 3], and the same a pixel further to the right."""
     y, x = np.mgrid[0:48, 0:64]
     waves = [0.5 + 0.4 * np.sin(x / 7 + y / 11), 0.5 + 0.4 * np.cos(x / 5), 0.5 + 0.4 * np.sin(y / 6)]
-    a = np.stack(waves).astype(np.float32)
-    return a, np.roll(a, 1, axis=2)
-
-
-def tensors(pair: tuple[np.ndarray, np.ndarray]) -> list[torch.Tensor]:
-    """Channel-first arrays as [H, W, 3] tensors."""
-    return [torch.from_numpy(np.ascontiguousarray(array.transpose(1, 2, 0))) for array in pair]
+    a = torch.from_numpy(np.stack(waves, -1)).float()
+    return a, a.roll(1, 1)
 
 
 def scikit_image(a: torch.Tensor, b: torch.Tensor, data_range: float) -> float:
@@ -49,7 +45,7 @@ def test_ssim1_and_ssim2_are_scikit_images(height: int, width: int, noise: float
 
 def test_the_gaussian_ssim_is_the_convolution_of_3dgs() -> None:
     """The metric and the loss; written out with torch's convolution, as the codebases do it."""
-    a, b = (image.double().permute(2, 0, 1)[None] for image in tensors(sine_pair()))
+    a, b = (image.double().permute(2, 0, 1)[None] for image in sine_pair())
     taps = torch.exp(-((torch.arange(11, dtype=torch.float64) - 5) ** 2) / (2 * 1.5**2))
     window = torch.outer(taps, taps).div(taps.sum() ** 2).expand(3, 1, 11, 11)
 
@@ -60,8 +56,8 @@ def test_the_gaussian_ssim_is_the_convolution_of_3dgs() -> None:
     var_a, var_b, cov = blur(a * a) - mean_a**2, blur(b * b) - mean_b**2, blur(a * b) - mean_a * mean_b
     top = (2 * mean_a * mean_b + 1e-4) * (2 * cov + 9e-4)
     expected = (top / ((mean_a**2 + mean_b**2 + 1e-4) * (var_a + var_b + 9e-4))).mean().item()
-    assert metrics.ssim_3dgs(*tensors(sine_pair())) == pytest.approx(expected, abs=1e-12)
-    assert ssim(*(image.double() for image in tensors(sine_pair()))).item() == pytest.approx(expected, abs=1e-12)
+    assert metrics.ssim_3dgs(*sine_pair()) == pytest.approx(expected, abs=1e-12)
+    assert ssim(*(image.double() for image in sine_pair())).item() == pytest.approx(expected, abs=1e-12)
 
 
 @pytest.mark.parametrize(("metric", "size"), [(metrics.ssim_range1, 7), (metrics.ssim_3dgs, 11)])
@@ -85,7 +81,7 @@ def test_what_cannot_be_compared_is_refused(metric, sizes, message) -> None:
 
 
 def test_flip_is_nvidias_own_and_without_its_package_it_is_not_measured(monkeypatch: pytest.MonkeyPatch) -> None:
-    a, b = tensors(sine_pair())
+    a, b = sine_pair()
     with monkeypatch.context() as patch:
         patch.setattr(importlib.util, "find_spec", lambda name: None)
         assert metrics.flip(a, b) is None

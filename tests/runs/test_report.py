@@ -136,8 +136,7 @@ def test_what_cannot_be_reported_is_one_sentence(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["report.md", "report.html", "quality.svg"])
 def test_a_file_that_no_report_wrote_is_kept(tmp_path: Path, name: str) -> None:
     (tmp_path / name).write_text("mine")
-    with pytest.raises(D2Error, match=rf"{name} was not written by `d2 report` and is kept: choose another place"):
-        make_report(committed(), tmp_path)
+    refuses(f"{name} was not written by `d2 report` and is kept: choose another", make_report, committed(), tmp_path)
     assert (tmp_path / name).read_text() == "mine"
     assert [path.name for path in tmp_path.iterdir()] == [name]
 

@@ -1,7 +1,5 @@
 """`d2 bench training`: equal CPU time, rows as they finish, reruns of what lacks; workers end with their parent."""
 
-import os
-import signal
 import subprocess
 import sys
 import time
@@ -134,7 +132,7 @@ from d2_plugin.runs.workers import worker_pool
 if __name__ == "__main__":
     with worker_pool(1) as pool:
         print(pool.submit(os.getpid).result(), flush=True)
-        pool.submit(time.sleep, 600).result()
+        pool.submit(time.sleep, 60).result()
 """
 
 
@@ -155,11 +153,7 @@ def test_a_busy_worker_ends_with_a_parent_that_is_killed(tmp_path: Path) -> None
         assert runs(worker)
         parent.kill()
         parent.wait()
-        for _ in range(100):
-            if not runs(worker):
-                break
-            time.sleep(0.1)
-        alive = runs(worker)
-        if alive:
-            os.kill(worker, signal.SIGKILL)
-        assert not alive
+    end = time.monotonic() + 10
+    while runs(worker) and time.monotonic() < end:
+        time.sleep(0.1)
+    assert not runs(worker)

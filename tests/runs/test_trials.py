@@ -29,23 +29,14 @@ NO_POINTS = TimedPoints(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
 GOOD, BAD = 0.8, 0.7
 
 
-def prior_of(labels: list[int]) -> DepthPrior:
-    """One row of pixels, with a sigma where there is a depth."""
-    row = torch.tensor([labels], dtype=torch.uint8)
+def test_what_is_believed_proposes_supervises_and_keeps_space_free_all_stereo_alone_or_nothing() -> None:
+    row = torch.tensor([[int(label) for label in Label]], dtype=torch.uint8)
     empty = (row == Label.EMPTY) | (row == Label.CONFLICT)
     depth = torch.full(row.shape, 2.0).masked_fill(empty, 0)
-    return DepthPrior(depth, row, None, torch.full(row.shape, 0.01).masked_fill(empty, torch.inf))
-
-
-def test_without_the_network_only_stereo_proposes_supervises_and_keeps_space_free() -> None:
-    kept = believed(prior_of([int(label) for label in Label]), "stereo")
-    only_stereo = torch.tensor([[label == Label.VERIFIED for label in Label]])
-    assert torch.equal(kept.support | kept.far, only_stereo)
-    assert torch.equal(kept.near_edge(3) > 0, only_stereo)
-
-
-def test_a_prior_that_is_believed_is_left_as_it_is_and_nothing_of_one_that_is_not() -> None:
-    prior = prior_of([int(label) for label in Label])
+    prior = DepthPrior(depth, row, None, torch.full(row.shape, 0.01).masked_fill(empty, torch.inf))
+    kept = believed(prior, "stereo")
+    assert torch.equal(kept.support | kept.far, row == Label.VERIFIED)
+    assert torch.equal(kept.near_edge(3) > 0, row == Label.VERIFIED)
     assert believed(prior, "all") is prior
     nothing = believed(prior, "nothing")
     assert not (nothing.support | nothing.far).any()

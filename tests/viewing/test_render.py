@@ -154,6 +154,8 @@ def test_a_run_of_which_nothing_is_left_or_known_is_one_sentence(
     state["model"] = parts | {"optimizer": state["model"]["optimizer"] | {"state": {}}}
     save_checkpoint(folder / "checkpoint.pt", state)
     assert "has no Gaussian left at step 40" in refused(command, folder)
+    (folder / "checkpoint.pt").write_bytes((folder / "checkpoint.pt").read_bytes()[:1000])
+    assert "is damaged" in refused(command, folder)
     (folder / "checkpoint.pt").unlink()
     assert "holds no checkpoint yet" in refused(command, folder)
     table = json.loads((folder / "run.json").read_text())
@@ -167,9 +169,8 @@ def test_a_run_that_still_trains_and_has_no_prior_is_shown_with_a_note(bare, tmp
     folder = shutil.copytree(bare, tmp_path / "<script>alert(1)<")
     state = torch.load(folder / "checkpoint.pt", weights_only=True)
     save_checkpoint(folder / "checkpoint.pt", state | {"step": 1})
-    assert f"{folder.name} still trains: this is step 1 of 2" in answered(
-        command, str(folder), "--output", str(tmp_path / "out.mp4")
-    )
+    said = answered(command, folder, "--output", tmp_path / "out.mp4")
+    assert f"{folder.name} still trains: this is step 1 of 2" in said
 
 
 def soft(count: int, width: int, height: int) -> list[np.ndarray]:

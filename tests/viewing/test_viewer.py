@@ -364,5 +364,4 @@ def test_d2_train_says_where_to_watch_and_ends_where_nobody_looks(room: Path, ba
     words = ["train", str(room), "--train-cameras", "train0,train1", "--iterations", "2", "--hooks", "none", "--view"]
     assert "watch it train at http://localhost:" in answered(*words, "--output", str(tmp_path / "run"))
     ends = [torch.load(folder / "checkpoint.pt", weights_only=True)["model"] for folder in (tmp_path / "run", bare)]
-    for name, value in ends[0]["parameters"].items():
-        assert torch.equal(value, ends[1]["parameters"][name]), "a watched run is bitwise the one that is not"
+    assert same(ends[0]["parameters"], ends[1]["parameters"]), "a watched run is bitwise the one that is not"

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 from tiny import ALL_HOOKS, make_trainer
-from viewing.chromium import Page, browser, decoded, executable
+from viewing.chromium import Page, browser, decoded
 
 from d2_plugin.viewing.live import Viewer
 from d2_plugin.viewing.viewed import KeptImages, ViewedRun
@@ -23,7 +23,6 @@ EVIL = "<script>window.hacked=1</script>"
 
 @pytest.fixture(scope="module")
 def new_page() -> Iterator[Callable[[], Page]]:
-    executable()
     with browser(640, 400) as new:
         yield new
 

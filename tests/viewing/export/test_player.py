@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from oracles.export_files import ReadPage
-from viewing.chromium import Page, browser, executable, image
+from viewing.chromium import Page, browser, image
 from viewing.export.scenes import DURATION, NASTY, make_scene, psnr, rasterized, sharp_model, with_harmonics
 
 from d2_plugin.backbones.model import SplatModel
@@ -24,7 +24,6 @@ CAMERAS = ("</script><b>left", "middle", "right")
 @pytest.fixture(scope="module")
 def new_page() -> Iterator[Callable[[], Page]]:
     """Pages of one browser for all tests: starting it is what takes long."""
-    executable()
     with browser(480, 360) as new:
         yield new
 
