@@ -203,7 +203,9 @@ def _projected(view: View, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 def _nearest_that_moves(aside: View, sides: Sequence[tuple[View, Tensor]], far: Tensor) -> Tensor:
     """Depth [H * W] from aside of the nearest place up to `far` that lies in what moves [H, W] in all of the views."""
-    down, right = (torch.arange(COARSE / 2, size, COARSE, device=far.device) for size in (aside.height, aside.width))
+    sizes = aside.height, aside.width  # of which the last block may be a part
+    middles = (torch.arange(COARSE / 2, size + COARSE / 2, COARSE, device=far.device) for size in sizes)
+    down, right = (middle.clamp(max=size - 0.5) for middle, size in zip(middles, sizes))
     row, column = torch.meshgrid(down, right, indexing="ij")
     depths = 1 / torch.linspace(1, 1 / NEAREST, DEPTHS, device=far.device) * far
     rays = torch.stack([column.flatten(), row.flatten(), torch.ones_like(row).flatten()])

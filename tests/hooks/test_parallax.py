@@ -118,6 +118,22 @@ def test_what_moves_may_hide_whatever_lies_behind_its_rays() -> None:
     assert len(in_sight(MIDDLE, *one)[0]) == len(everything)  # what one camera alone sees moving is not there
 
 
+@pytest.mark.parametrize("cut", range(4))
+def test_images_may_have_any_number_of_rows_and_columns(cut: int) -> None:
+    """What moves is looked for in blocks of pixels: of 362 columns the last two stand in none that is whole."""
+    left, middle, right = (replace(view, height=24 - cut, width=WIDTH - cut) for view in (LEFT, MIDDLE, RIGHT))
+    seen = []
+    for moves in (False, True):
+        sides = []
+        for view in (left, right):
+            maps = [map_ if map_ is None else map_[: view.height, : view.width] for map_ in prior_of(view)]
+            sides.append(Side(view, DepthPrior(*maps), torch.full((view.height, view.width), moves)))
+        pixels, _ = in_sight(middle, *sides)
+        (number,) = set(torch.bincount(pixels // left.width, minlength=left.height).tolist())  # of each row
+        seen.append(number)
+    assert seen[0] >= 2 * seen[1], "a person may stand before half of it"
+
+
 @pytest.mark.parametrize(("share", "seen"), [(1.0, True), (1.3, True), (1.8, False), (0.9, False)])
 def test_both_cameras_place_a_surface_within_a_pixel_or_so_of_each_other(share: float, seen: bool) -> None:
     other = prior_of(RIGHT)._replace(depth=share * prior_of(RIGHT).depth)
