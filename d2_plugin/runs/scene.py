@@ -141,8 +141,9 @@ def _split(recording: Recording, settings: RunSettings) -> tuple[tuple[str, ...]
     test = settings.test_cameras
     if test is None:
         test = tuple(name for name in recording.cameras if name not in settings.train_cameras)
-    refuse_unknown("camera", (*settings.train_cameras, *test), recording.cameras)
-    both = sorted(set(settings.train_cameras) & set(test))
-    if both:
-        raise D2Error(f"camera {both[0]} is named for training and for test: leave it out of one")
+    names = (*settings.train_cameras, *test)
+    refuse_unknown("camera", names, recording.cameras)
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise D2Error(f"camera {twice[0]} is named twice: name each once, for training or for test")
     return settings.train_cameras, test
