@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 import logging
+import math
 import os
 import threading
 import warnings
@@ -45,6 +46,10 @@ from d2_plugin.registry import ADAPTERS, load
 from d2_plugin.values import checked_arguments, fitting
 
 _log = logging.getLogger(__name__)
+
+MOST_VIEWS = 64
+"""Views of one evaluation, at most, of a recording that is long for its run: each should be looked at once while there
+is still insertion."""
 
 if hasattr(os, "register_at_fork"):
     # OpenMP's threads are not there after a fork, and a child that used them would wait for them for ever.
@@ -293,12 +298,14 @@ class D2Hooks:
         def sample() -> Sequence:
             first = 0 if self._evaluated else self._sampler.cameras
             self._evaluated = True
-            return self._sampler.sample(max(self.config.views_per_evaluation, first), self.generator)
+            left = self.hooks["densify"].window.left(now) if "densify" in self.hooks else 0
+            due = min(math.ceil(self._sampler.unseen / left), MOST_VIEWS) if left else 0
+            return self._sampler.sample(max(self.config.views_per_evaluation, first, due), self.generator)
 
         assert self.prior is not None, "a step without hooks has no context"
-        known, motion = self._sampler, self.config.motion
+        now, known, motion = schedule_step(self.backbone, step), self._sampler, self.config.motion
         seen = sample, known.instants, known.beside, motion is not None and motion.insert
-        return Context(schedule_step(self.backbone, step), self.backbone, views, self.prior, self.generator, *seen)
+        return Context(now, self.backbone, views, self.prior, self.generator, *seen)
 
     def _retire_if_idle(self, step: int, name: str, edit: Edit | None, context: Context) -> None:
         if name not in HOOKS or not HOOKS[name].edits_structure or not context.evaluation:

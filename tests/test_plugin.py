@@ -12,13 +12,14 @@ import numpy as np
 import pytest
 import torch
 from refusals import refuses
-from tiny import ALL_HOOKS, BACKBONES, TinyStore, make_adapter, make_model, make_trainer, make_views
+from tiny import ALL_HOOKS, BACKBONES, TinyFrames, TinyStore, make_adapter, make_model, make_trainer, make_views
 
 from d2_plugin import D2Error, D2Hooks
 from d2_plugin.adapters.yang4d import Yang4DAdapter
-from d2_plugin.backbones.trainer import Trainer
+from d2_plugin.backbones.trainer import Trainer, TrainSettings
 from d2_plugin.config import D2Config, DensifyConfig, PruneConfig
 from d2_plugin.hooks.finite import Diverged, FiniteCheck
+from d2_plugin.hooks.hook import Context, Hook, HookConfig
 from d2_plugin.hooks.views import ViewSampler
 from d2_plugin.protocol import Points, Splats, View
 from d2_plugin.rasterizer import rasterize
@@ -105,6 +106,26 @@ def test_evaluations_visit_every_view_before_any_twice() -> None:
     keys = [(v.camera, v.frame) for _ in range(2) for v in sampler.sample(3, generator)]
     assert len(set(keys)) == 6
     assert ViewSampler().sample(3, generator) == []
+
+
+def test_every_view_is_looked_at_before_insertion_ends() -> None:
+    looked: list[list] = []
+
+    class Watching(Hook):
+        def edit(self, context: Context) -> None:
+            looked.append([(surveyed.view.camera, surveyed.view.frame) for surveyed in context.evaluation])
+
+    config = D2Config(densify=DensifyConfig(start=5, stop=25, every=10), views_per_evaluation=1)
+    hooks = {"watching": Watching(HookConfig(start=5, every=10))}
+    settings = TrainSettings(iterations=36)
+    trainer = Trainer(
+        make_model(), TinyFrames(), settings, lambda model: D2Hooks(config, make_adapter(model), TinyStore(), hooks)
+    )
+    trainer.run(14)
+    trainer.load_state_dict(copy.deepcopy(trainer.state_dict()))
+    trainer.run()
+    assert [len(views) for views in looked] == [3, 3, 1, 1], "five are known at first; insertion looks twice"
+    assert len({*looked[0], *looked[1]}) == 6
 
 
 def test_a_hook_without_a_prior_says_what_to_set() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -34,6 +35,10 @@ class Window:
     def due(self, step: int) -> bool:
         """Whether the hook runs at `step` (1-based, as trainers count)."""
         return self.start <= step and (self.stop is None or step < self.stop) and (step - self.start) % self.every == 0
+
+    def left(self, step: int) -> float:
+        """How often the hook is due from `step` on; infinite where it runs to the end, 0 after it."""
+        return math.inf if self.stop is None else max(0, -(-(self.stop - step) // self.every))
 
 
 Chosen = TypeVar("Chosen", bound="HookConfig")

@@ -5,10 +5,14 @@ every trained image, and between two instants show both. The prior knows where e
 1 to 3 quarters of the way (`d2_plugin.priors.between`). That image supervises whatever moves the Gaussians, a
 space-time covariance, a deformation network, polynomials, through `slice_at`; and `densify` inserts what is missing
 halfway.
+
+A Gaussian that lives for an instant is trained by the views of that instant alone, few of the steps of a long
+recording. So what moves is looked at again there: in each step at other instants of the camera as well.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -18,6 +22,15 @@ from torch import Tensor
 from d2_plugin.hooks.hook import Context, HookConfig, ImageHook
 from d2_plugin.protocol import Label, View, call_optional
 from d2_plugin.settings import Range
+
+LOOKS = 40
+"""Looks at what moves at each instant, beside those of the trainer's own views, that a long run makes."""
+
+SHORT = 1000
+"""Steps below which there are none: what stands still has as much to learn."""
+
+MOST_AGAIN = 4
+"""Most of them in one step."""
 
 ORDER = (2, 1, 2, 3)
 """Quarters of the way in turn: halfway, farthest from what is trained, twice as often."""
@@ -31,6 +44,15 @@ class MotionConfig(HookConfig):
     """Weight beside the trainer's own photometric loss."""
     insert: bool = True
     """Whether `densify` also inserts what moves at instants halfway."""
+    again: Annotated[float, Range(0, 1)] = 0.0
+    """For each instant of the camera, how many others are looked at in a step, where they move: a whole number in all,
+    four at most. Runs of a thousand steps and more have 40 / their steps, which is none below 25 instants for each
+    thousand steps."""
+
+    @classmethod
+    def for_iterations(cls, iterations: int) -> MotionConfig:
+        """The defaults; in a run that is not short, with looks at other instants."""
+        return cls(again=LOOKS / iterations if iterations >= SHORT else 0.0)
 
 
 class Motion(ImageHook):
@@ -40,19 +62,32 @@ class Motion(ImageHook):
 
     def term(self, context: Context, view: View) -> Tensor | None:
         """See `ImageHook.term`."""
+        looks = [self._compared(context, *look) for look in self._looks(context, view)]
+        known = [term for term in looks if term is not None]
+        return torch.stack(known).sum() if known else None
+
+    def _looks(self, context: Context, view: View) -> Iterator[tuple[View, Tensor, Tensor | None]]:
+        """Views of what moves, their images uint8 [H, W, 3] and where these are known [H, W] (none: everywhere)."""
+        seen, quarter = context.instants(view.camera), ORDER[context.step // self.config.every % len(ORDER)]
+        pair = context.prior.underway(view, seen, quarter)
+        if pair is not None and (maps := pair[1].maps.codes).colors is not None:
+            yield pair[0], maps.colors, maps.labels != Label.CONFLICT
+        for _ in range(min(int(self.config.again * len(seen)), MOST_AGAIN)):
+            other = seen[int(torch.randint(len(seen), (1,), generator=context.generator))]
+            moving = context.prior.moving(other, seen)
+            if moving is not None:
+                yield *moving, None
+
+    def _compared(self, context: Context, view: View, shown: Tensor, known: Tensor | None) -> Tensor | None:
+        """The photometric loss of what a view shows against its image where that is known."""
         from d2_plugin.gaussians.photometric import photometric_loss  # a trainer without this hook needs none of it
 
-        quarter = ORDER[context.step // self.config.every % len(ORDER)]
-        pair = context.prior.underway(view, context.instants(view.camera), quarter)
-        if pair is None:
+        if (drawn := self.drawn(context.backbone, view)) is None:
             return None
-        between, prior = pair[0], pair[1].maps.codes
-        if prior.colors is None or (drawn := self.drawn(context.backbone, between)) is None:
-            return None
-        shown, labels = (part.to(view.K.device, non_blocking=True) for part in (prior.colors, prior.labels))
-        image = shown.to(drawn.color) / 255
+        image = shown.to(view.K.device, non_blocking=True).to(drawn.color) / 255
         # A background that is not known shows what the image shows.
         unknown = drawn._replace(color=drawn.color + (1 - drawn.alpha)[..., None] * image)
-        color = call_optional(context.backbone, "behind", drawn, between, default=unknown).color
-        moved = (labels != Label.CONFLICT)[..., None]
-        return photometric_loss(color, torch.where(moved, image, color.detach()))
+        color = call_optional(context.backbone, "behind", drawn, view, default=unknown).color
+        if known is not None:
+            image = torch.where(known.to(view.K.device, non_blocking=True)[..., None], image, color.detach())
+        return photometric_loss(color, image)

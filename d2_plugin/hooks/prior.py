@@ -346,13 +346,20 @@ class PriorLoader:
         following = next((other for other in instants if other.frame == frame), None)
         if following is None or kept is None or part is None or shape != (view.height, view.width):
             return None
-        rows, columns = part
-        K = view.K.clone()
-        K[0, 2] -= columns.start
-        K[1, 2] -= rows.start
         time = view.time + quarter / 4 * (following.time - view.time)
-        size = {"width": columns.stop - columns.start, "height": rows.stop - rows.start}
-        return replace(view, time=time, K=K, **size), kept
+        return replace(_window(view, part), time=time), kept
+
+    def moving(self, view: View, instants: Sequence[View]) -> tuple[View, Tensor] | None:
+        """The part of a view that moves on to the camera's next instant, at the last one that has come from the one
+        before, and its image uint8 [H, W, 3]; None where `underway` knows nothing of it."""
+        kept = self._look_up(view)
+        earlier = [other for other in instants if other.frame < view.frame]
+        for start in (view, *sorted(earlier, key=lambda other: other.frame)[-1:]):
+            if self.underway(start, instants) is not None and kept is not None and kept.maps.codes.colors is not None:
+                part = self._next[start.camera, start.frame + 0.5][2]
+                assert part is not None, "underway says None there"
+                return _window(view, part), kept.maps.codes.colors[part]
+        return None
 
     def believed(self, prior: DepthPrior) -> DepthPrior:
         """What of a prior is believed."""
@@ -386,6 +393,15 @@ def _moving_part(maps: DepthPrior) -> tuple[slice, slice] | None:
         slice(max(a - RIM, 0), min(b + RIM + 1, size)) for a, b, size in zip(first, last, maps.depth.shape)
     )
     return rows, columns
+
+
+def _window(view: View, part: tuple[slice, slice]) -> View:
+    """Those rows and columns of a view."""
+    rows, columns = part
+    K = view.K.clone()
+    K[0, 2] -= columns.start
+    K[1, 2] -= rows.start
+    return replace(view, K=K, width=columns.stop - columns.start, height=rows.stop - rows.start)
 
 
 def _outline(far: Tensor) -> Tensor:

@@ -19,7 +19,8 @@ class ViewSampler:
 
     def __init__(self) -> None:
         self._views: dict[tuple[str, int], View] = {}
-        self._queues: dict[str, list[int]] = {}
+        self._queues: dict[str, list[int]] = {}  # frames of a camera that its present round has still to come to
+        self._unseen: set[tuple[str, int]] = set()
         self._next_camera = 0
         self._moving = False
 
@@ -31,7 +32,14 @@ class ViewSampler:
             poses = [known.T_camera_world for known in self.instants(view.camera)[:1]]
             self._moving |= not all(torch.equal(pose, view.T_camera_world) for pose in poses)
             self._views[view.camera, view.frame] = view
+            self._queues.setdefault(view.camera, []).append(view.frame)
+            self._unseen.add((view.camera, view.frame))
         return new
+
+    @property
+    def unseen(self) -> int:
+        """How many known views no sample had yet."""
+        return len(self._unseen)
 
     @property
     def cameras(self) -> int:
@@ -56,20 +64,21 @@ class ViewSampler:
             self._next_camera += 1
             key = (camera, self._next_frame(camera, generator))
             chosen.setdefault(key, self._views[key])
+        self._unseen -= chosen.keys()
         return list(chosen.values())
 
     def _next_frame(self, camera: str, generator: torch.Generator) -> int:
-        queue = self._queues.setdefault(camera, [])
+        queue = self._queues[camera]
         if not queue:
-            frames = sorted(frame for name, frame in self._views if name == camera)
-            queue += [frames[i] for i in torch.randperm(len(frames), generator=generator).tolist()]
-        return queue.pop()
+            queue += [frame for name, frame in self._views if name == camera]
+        return queue.pop(int(torch.randint(len(queue), (1,), generator=generator)))
 
     def state_dict(self) -> dict[str, Any]:
         """The known views and the position in their order; tensors and plain values only."""
         return {
             "views": [vars(view).copy() for view in self._views.values()],
             "queues": {camera: list(queue) for camera, queue in self._queues.items()},
+            "unseen": sorted(self._unseen),
             "next_camera": self._next_camera,
         }
 
@@ -79,4 +88,5 @@ class ViewSampler:
         for view in state["views"]:
             self.add(View(**view))
         self._queues = {camera: list(queue) for camera, queue in state["queues"].items()}
+        self._unseen = {(camera, frame) for camera, frame in state.get("unseen", ())}
         self._next_camera = state["next_camera"]

@@ -138,6 +138,50 @@ class TestWhereThereIsNothingToLearnFrom:
             assert Motion(MotionConfig()).loss(context_of(adapter, Halfway(), views, known)) is None
 
 
+class Taken(Halfway):
+    """The same with images of the instants: grey, but for a bar at the left of the second one."""
+
+    def prior(self, camera: str, frame: int) -> DepthPrior:
+        image = torch.full((HEIGHT, WIDTH, 3), 128, dtype=torch.uint8)
+        image[:, : 4 * frame] = 255
+        return super().prior(camera, frame)._replace(colors=image)
+
+
+class TestOtherInstants:
+    def test_are_looked_at_in_runs_that_are_long_for_their_steps_and_not_short(self) -> None:
+        assert [MotionConfig.for_iterations(steps).again for steps in (999, 1000, 30_000)] == [0, 0.04, 40 / 30_000]
+
+    @pytest.mark.parametrize("view", [FIRST, SECOND])
+    def test_show_the_image_that_was_taken_where_something_moves(self, view: View) -> None:
+        loader = PriorLoader(Taken())
+        window, image = loader.moving(view, [FIRST, SECOND])
+        assert (window.time, window.width, window.height) == (view.time, WIDTH // 4 + RIM, HEIGHT)
+        assert torch.equal(image, Taken().prior("", view.frame).colors[:, : WIDTH // 4 + RIM])
+        assert loader.moving(view, [view]) is None, "where it moves to, or comes from, has not been seen yet"
+
+    def test_train_what_lives_at_another_instant_than_the_step_s(self) -> None:
+        changed = []
+        for again in (0.0, 1.0):
+            adapter = make_adapter(make_model())
+            rows = adapter.model.gaussians
+            with torch.no_grad():
+                rows["times"].fill_(SECOND.time)
+                rows["log_time_scales"].fill_(-3.5)
+            loss = loss_of(adapter, Taken(), again=again)
+            gradient = torch.autograd.grad(loss, rows["base_colors"], allow_unused=True)[0]
+            changed.append(gradient is not None and bool(gradient.any()))
+        assert changed == [False, True]
+
+    def test_are_four_at_most_in_a_step(self) -> None:
+        known = [replace(FIRST, frame=frame, time=frame / 2) for frame in range(300)]
+        motion, store = Motion(MotionConfig(again=0.5)), Taken()
+        store.underway = lambda camera, frame, quarter: (frame + 1, Halfway().underway(camera, 0, quarter)[1])
+        context = context_of(make_adapter(make_model()), store, known[:1], known)
+        looks = [view.time for view, _, _ in motion._looks(context, FIRST)]
+        assert len(looks) == 5
+        assert looks[0] == 0.25, "halfway"
+
+
 class TestInsertionHalfway:
     def points(self, insert: bool) -> Tensor:
         """Times and lifetimes of what is inserted where nothing stands."""
@@ -170,7 +214,7 @@ def trainer(**more: HookConfig) -> Trainer:
     return Trainer(make_model(), TinyFrames(), TrainSettings(iterations=18, seed=3), attach)
 
 
-@pytest.mark.parametrize("hook", [{"motion": MotionConfig()}, {"parallax": ParallaxConfig(every=1)}])
+@pytest.mark.parametrize("hook", [{"motion": MotionConfig(again=1.0)}, {"parallax": ParallaxConfig(every=1)}])
 def test_a_resumed_run_is_bitwise_the_uninterrupted_one_and_not_that_without_the_hook(hook: dict) -> None:
     whole, first, second, without = (trainer(**(hook if i < 3 else {})) for i in range(4))
     whole.run()
