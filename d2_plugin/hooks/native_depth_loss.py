@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from d2_plugin.compiler.kernels import load_kernel
+from d2_plugin.compiler.kernels import load_kernel, structure
 from d2_plugin.hooks.prior import KnownMaps
 from d2_plugin.rasterizer.native import KERNELS as RASTERIZER_KERNELS
 
@@ -24,17 +24,14 @@ HEADERS = (RASTERIZER_KERNELS / "parallel.h", RASTERIZER_KERNELS / "simd.h")
 FLAGS = ("-ffp-contract=fast",)
 
 
-class _Call(ctypes.Structure):
-    """d2::DepthLoss of kernels/depth_loss.cpp; null gradients are not computed."""
-
-    _fields_ = (
-        ("pixels", ctypes.c_int64),
-        ("threads", ctypes.c_int32),
-        *((name, ctypes.c_float) for name in ("tau_v", "sigma_full", "epsilon")),
-        *((name, ctypes.c_double) for name in ("opaque", "factor")),
-        *((name, ctypes.c_void_p) for name in ("kind", "depth", "sigma", "depth_sum", "alpha")),
-        *((name, ctypes.c_void_p) for name in ("grad_depth_sum", "grad_alpha")),
-    )
+_Call = structure(
+    "long pixels",
+    "int threads",
+    "float tau_v sigma_full epsilon",
+    "double opaque factor",
+    "pointer kind depth sigma depth_sum alpha grad_depth_sum grad_alpha",
+)
+"""d2::DepthLoss of kernels/depth_loss.cpp; null gradients are not computed."""
 
 
 @functools.cache
@@ -72,13 +69,11 @@ class _DepthLoss(torch.autograd.Function):
         tau_v, sigma_full, epsilon, opaque, factor = constants
         call = _Call(depth_sum.numel(), torch.get_num_threads(), tau_v, sigma_full, epsilon)
         call.opaque, call.factor = opaque / max(known.near, 1), factor
-        call.kind, call.depth = kind.data_ptr(), depth.data_ptr()
-        call.sigma = None if sigma is None else sigma.data_ptr()
-        call.depth_sum, call.alpha = depth_sum.data_ptr(), alpha.data_ptr()
+        call.point(kind=kind, depth=depth, sigma=sigma, depth_sum=depth_sum, alpha=alpha)
         if any(ctx.needs_input_grad[:2]):
-            gradients = torch.empty_like(depth_sum), torch.empty_like(alpha)
-            call.grad_depth_sum, call.grad_alpha = (part.data_ptr() for part in gradients)
-            ctx.save_for_backward(*gradients)
+            by_depth_sum, by_alpha = torch.empty_like(depth_sum), torch.empty_like(alpha)
+            call.point(grad_depth_sum=by_depth_sum, grad_alpha=by_alpha)
+            ctx.save_for_backward(by_depth_sum, by_alpha)
         return depth_sum.new_full((), kernel.d2_depth_loss(call))
 
     @staticmethod
