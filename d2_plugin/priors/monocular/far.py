@@ -56,7 +56,8 @@ def far_pixels(inverse: np.ndarray, geometric: np.ndarray, image: np.ndarray) ->
         return clear
     colored = _like_around(cv2, image.astype(np.float32) / 255, clear)
     candidates = (clear | ((beyond < PERHAPS) & colored)) & ~measured
-    return _touching(cv2, candidates, clear)
+    _, pieces = cv2.connectedComponents(candidates.astype(np.uint8), connectivity=4)
+    return np.isin(pieces, np.unique(pieces[clear]))
 
 
 def _large(cv2: Any, mask: np.ndarray) -> np.ndarray:
@@ -75,11 +76,3 @@ def _like_around(cv2: Any, image: np.ndarray, clear: np.ndarray) -> np.ndarray:
     mean = cv2.GaussianBlur(image * clear[..., None], (0, 0), sigma) / np.maximum(weight, 1e-6)[..., None]
     red, green, blue = np.moveaxis(image - mean, -1, 0)
     return (weight > 1e-3) & (red * red + green * green + blue * blue < COLOR**2)
-
-
-def _touching(cv2: Any, mask: np.ndarray, seeds: np.ndarray) -> np.ndarray:
-    count, pieces = cv2.connectedComponents(mask.astype(np.uint8), connectivity=4)
-    keep = np.zeros(count, bool)
-    keep[np.unique(pieces[seeds & mask])] = True
-    keep[0] = False
-    return keep[pieces]
