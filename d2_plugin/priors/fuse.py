@@ -35,11 +35,6 @@ def cross_source_discrepancy(mono: np.ndarray, geometric: np.ndarray) -> np.ndar
     return np.where(known, relative, np.inf).astype(np.float32)
 
 
-def verified_region(discrepancy: np.ndarray, tau_c: float | np.ndarray) -> np.ndarray:
-    """Omega^v: pixels of Omega^g whose discrepancy is below tau_c, bool [H, W]; tau_c may be a map [H, W]."""
-    return discrepancy < tau_c
-
-
 def hanging_pixels(mono: np.ndarray, limit: float) -> np.ndarray:
     """Pixels [H, W] bool of a monocular map that hang between a near and a far surface; an addition to the paper.
 
@@ -99,7 +94,7 @@ def fuse(
         verified = geometric > 0
     else:
         known = geometric > 0
-        verified = verified_region(cross_source_discrepancy(mono, geometric), tau_c)
+        verified = cross_source_discrepancy(mono, geometric) < tau_c  # Omega^v, within Omega^g
         if np.count_nonzero(known & ~verified) > most_vetoed * np.count_nonzero(known):
             verified = known
     depth, labels = _labelled(alone, geometric, verified)
