@@ -14,7 +14,7 @@ import math
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from d2_plugin.errors import D2Error
 from d2_plugin.recordings.cameras.camera import look_at, pinhole
 from d2_plugin.recordings.recording import Camera, Recording, Source
 from d2_plugin.recordings.synthetic import materials
-from d2_plugin.recordings.synthetic.raycast import Motion, Room, Scene, Solid, render_color, render_depth
+from d2_plugin.recordings.synthetic.raycast import Room, Scene, Solid, render_color, render_depth
 from d2_plugin.values import checked_arguments
 
 CACHE_BYTES = 64 * 2**20  # images kept after rendering them, oldest forgotten first
@@ -112,8 +112,8 @@ def furnished_room(seed: int, moving: bool) -> Scene:
         _box((-1.35, 1.12, 0.88), (0.2, 0.15, 0.18), -15, materials.confetti(rng, (0.2, 0.42, 0.38)), 0.6),
         _box((-0.2, 1.98, 1.55), (0.55, 0.015, 0.4), 0, materials.confetti(rng, (0.93, 0.9, 0.8)), 1.1),
         _box((0.1, 0.1, 0.008), (1.2, 0.8, 0.008), 0, materials.confetti(rng, (0.5, 0.16, 0.18), 120, muted=0.45), 1.2),
-        Solid(_rolling(moving), materials.beach_ball(rng), np.full(3, 0.27), radius=0.27),
-        Solid(_turning(moving), materials.confetti(rng, (0.92, 0.72, 0.16), 40), np.array([0.2, 0.2, 0.2]), repeat=0.4),
+        Solid(partial(_rolling, moving), materials.beach_ball(rng), np.full(3, 0.27), radius=0.27),
+        Solid(partial(_turning, moving), materials.confetti(rng, (0.92, 0.72, 0.16), 40), np.full(3, 0.2), repeat=0.4),
     )
     spread = 0.09 * np.array([(-1, -1, 0), (1, -1, 0), (-1, 1, 0), (1, 1, 0)])
     return Scene(room, solids, np.array([-0.9, -1.6, 2.75]) + spread)
@@ -175,23 +175,18 @@ def _box(
     return Solid(lambda seconds: pose, texture, np.array(half_size), repeat=repeat)
 
 
-def _rolling(moving: bool, radius: float = 0.27, amplitude: float = 0.85, period: float = 4.0) -> Motion:
-    def motion(seconds: float) -> tuple[np.ndarray, np.ndarray]:
-        x = amplitude * math.sin(2 * math.pi * (seconds if moving else 0.0) / period - 0.6)
-        angle = x / radius
-        rolled = np.array([[math.cos(angle), 0, math.sin(angle)], [0, 1, 0], [-math.sin(angle), 0, math.cos(angle)]])
-        return rolled, np.array([x, -0.35, radius + 0.016])
-
-    return motion
+def _rolling(moving: bool, seconds: float) -> tuple[np.ndarray, np.ndarray]:
+    radius, amplitude, period = 0.27, 0.85, 4.0
+    x = amplitude * math.sin(2 * math.pi * (seconds if moving else 0.0) / period - 0.6)
+    angle = x / radius
+    rolled = np.array([[math.cos(angle), 0, math.sin(angle)], [0, 1, 0], [-math.sin(angle), 0, math.cos(angle)]])
+    return rolled, np.array([x, -0.35, radius + 0.016])
 
 
-def _turning(moving: bool, period: float = 5.0) -> Motion:
-    def motion(seconds: float) -> tuple[np.ndarray, np.ndarray]:
-        phase = 2 * math.pi * (seconds if moving else 0.0) / period
-        centre = np.array([0.55 * math.cos(phase), 0.55 + 0.3 * math.sin(phase), 0.75 + 0.15 * math.sin(2 * phase)])
-        return _about_z(1.5 * math.sin(phase)), centre
-
-    return motion
+def _turning(moving: bool, seconds: float) -> tuple[np.ndarray, np.ndarray]:
+    phase = 2 * math.pi * (seconds if moving else 0.0) / 5.0
+    centre = np.array([0.55 * math.cos(phase), 0.55 + 0.3 * math.sin(phase), 0.75 + 0.15 * math.sin(2 * phase)])
+    return _about_z(1.5 * math.sin(phase)), centre
 
 
 def _about_z(angle: float) -> np.ndarray:
