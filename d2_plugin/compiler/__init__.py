@@ -105,7 +105,9 @@ def load_library(
     if prebuilt is not None:
         return ctypes.CDLL(str(prebuilt))
     compiler = find_compiler()
-    command = [*compiler, *_flags(compiler, (*sources, *headers), flags)]
+    includes = dict.fromkeys(f"-I{file.parent}" for file in (*sources, *headers))
+    user = _words("D2_CXXFLAGS", os.environ.get("D2_CXXFLAGS", ""))
+    command = [*compiler, *BASE_FLAGS, *_native_flags(tuple(compiler)), *flags, *includes, *user]
     key = _key(_predefined(tuple(command)), sources, headers, flags)
     library = cache_folder() / f"{name}-{key}.so"
     with _guard:
@@ -113,12 +115,6 @@ def load_library(
             check_private(library.parent)
             _loaded[library] = _open(library) or _build(library, command, sources)
         return _loaded[library]
-
-
-def _flags(compiler: Sequence[str], files: Sequence[Path], extra: Sequence[str]) -> list[str]:
-    includes = dict.fromkeys(f"-I{file.parent}" for file in files)
-    user = _words("D2_CXXFLAGS", os.environ.get("D2_CXXFLAGS", ""))
-    return [*BASE_FLAGS, *_native_flags(tuple(compiler)), *extra, *includes, *user]
 
 
 @functools.cache
