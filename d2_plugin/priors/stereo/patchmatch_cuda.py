@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 from d2_plugin.compiler.driver import Driver
+from d2_plugin.compiler.kernels import fields
 from d2_plugin.compiler.nvrtc import NoCuda, Program, build
 from d2_plugin.priors.stereo.patchmatch_kernel import (
     CONSENSUS_PASSES,
@@ -38,12 +39,7 @@ THREADS = 64
 class Call(ctypes.Structure):
     """d2::Call of kernels/patchmatch.cu: what one launch works on."""
 
-    _fields_ = (
-        ("task", Task),
-        *((name, ctypes.c_int32) for name in ("colour", "round", "radius")),
-        ("tolerance", ctypes.c_float),
-        ("averaged", ctypes.c_void_p),
-    )
+    _fields_ = (("task", Task), *fields("int colour round radius", "float tolerance", "pointer averaged"))
 
 
 def flags_for(sources: int) -> tuple[str, ...]:
