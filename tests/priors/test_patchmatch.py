@@ -96,15 +96,17 @@ def seen_plane(camera: Camera, normal: np.ndarray, offset: float, cost: float) -
     return LevelView(camera, image.astype(np.uint8), image.astype(np.uint32), planes, image == 0, image + cost, None)
 
 
+def moved(camera: Camera, unit: float) -> Camera:
+    """The same camera where a unit of length is so many times shorter."""
+    T = camera.T_camera_world.copy()
+    T[:3, 3] *= unit
+    return replace(camera, T_camera_world=T)
+
+
 @pytest.mark.parametrize("normal", [(0.0, 0, 1), (0.5, -0.3, 1), (-1.5, 0.2, 1)])
 @pytest.mark.parametrize("unit", [1e-3, 1.0, 1e4])
 def test_a_plane_handed_over_is_the_same_plane_of_the_world(rig: Rig, normal: tuple[float, ...], unit: float) -> None:
-    def placed(camera: Camera) -> Camera:
-        T = camera.T_camera_world.copy()
-        T[:3, 3] *= unit
-        return replace(camera, T_camera_world=T)
-
-    ours, theirs = (placed(camera) for camera in rig.cameras[:2])
+    ours, theirs = (moved(camera, unit) for camera in rig.cameras[:2])
     centre = ours.centre + 0.6 * sum(rig.depth_range) * unit * ours.T_camera_world[2, :3]
     facing = np.array(normal) @ ours.T_camera_world[:3, :3]
     target, source = (seen_plane(camera, facing, facing @ centre, 0.1) for camera in (ours, theirs))
@@ -136,13 +138,8 @@ def test_only_good_planes_are_handed_over_the_best_of_them_and_none_seen_edge_on
 
 @pytest.mark.parametrize("scale", [1e-3, 1e4])
 def test_the_unit_of_length_does_not_matter(rig: Rig, native: Maps, scale: float) -> None:
-    def stretched(camera: Camera) -> Camera:
-        T = camera.T_camera_world.copy()
-        T[:3, 3] *= scale
-        return replace(camera, T_camera_world=T)
-
     (near, far), metres = rig.depth_range, native[0][0]
-    cameras = [stretched(camera) for camera in rig.cameras]
+    cameras = [moved(camera, scale) for camera in rig.cameras]
     other = patchmatch(grays(rig), cameras, (near * scale, far * scale))[0][0] / scale
     assert np.median(np.abs(other - metres)[metres > 0] / metres[metres > 0]) < 1e-3
 
