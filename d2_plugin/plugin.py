@@ -292,13 +292,13 @@ class D2Hooks:
         now = schedule_step(self.backbone, step)
         if ends and now == schedule_step(self.backbone, step - 1):
             return []  # it was due at an earlier step of this pace
-        return [(name, hook) for name, hook in self.hooks.items() if name not in self.retired and hook.window.due(now)]
+        return [(name, hook) for name, hook in self.hooks.items() if name not in self.retired and hook.config.due(now)]
 
     def _context(self, step: int, views: Sequence) -> Context:
         def sample() -> Sequence:
             first = 0 if self._evaluated else self._sampler.cameras
             self._evaluated = True
-            left = self.hooks["densify"].window.left(now) if "densify" in self.hooks else 0
+            left = self.hooks["densify"].config.left(now) if "densify" in self.hooks else 0
             due = min(math.ceil(self._sampler.unseen / left), MOST_VIEWS) if left else 0
             return self._sampler.sample(max(self.config.views_per_evaluation, first, due), self.generator)
 

@@ -24,23 +24,6 @@ FREE_SIGMAS = 3.0
 """Space is known to be free up to D* less this many standard deviations."""
 
 
-@dataclass(frozen=True)
-class Window:
-    """The steps at which a hook is due: from start, every so many steps, up to but not including stop."""
-
-    start: int = 0
-    stop: int | None = None
-    every: int = 1
-
-    def due(self, step: int) -> bool:
-        """Whether the hook runs at `step` (1-based, as trainers count)."""
-        return self.start <= step and (self.stop is None or step < self.stop) and (step - self.start) % self.every == 0
-
-    def left(self, step: int) -> float:
-        """How often the hook is due from `step` on; infinite where it runs to the end, 0 after it."""
-        return math.inf if self.stop is None else max(0, -(-(self.stop - step) // self.every))
-
-
 Chosen = TypeVar("Chosen", bound="HookConfig")
 
 
@@ -60,10 +43,13 @@ class HookConfig(Settings):
         """The defaults with a schedule that fits a run of so many steps."""
         return cls()
 
-    @property
-    def window(self) -> Window:
-        """The steps at which the hook is due."""
-        return Window(self.start, self.stop, self.every)
+    def due(self, step: int) -> bool:
+        """Whether the hook runs at `step` (1-based, as trainers count): from start to before stop, every so many."""
+        return self.start <= step and (self.stop is None or step < self.stop) and (step - self.start) % self.every == 0
+
+    def left(self, step: int) -> float:
+        """How often it is due from `step` on; infinite where it runs to the end, 0 after it."""
+        return math.inf if self.stop is None else max(0, -(-(self.stop - step) // self.every))
 
 
 def steps_between_evaluations(iterations: int) -> int:
@@ -133,7 +119,6 @@ class Hook:
     def __init__(self, config: Any) -> None:
         """`config` is an instance of the hook's own `HookConfig`."""
         self.config = config
-        self.window: Window = config.window
 
     def loss(self, context: Context) -> Tensor | None:
         """A term to add to the training loss of this step, or None."""

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, Protocol
 from torch import Tensor
 
 from d2_plugin.hooks import HOOKS
-from d2_plugin.hooks.hook import Hook
+from d2_plugin.hooks.hook import Hook, HookConfig
 from d2_plugin.hooks.prior import PriorLoader
 from d2_plugin.protocol import Backbone, schedule_step
 
@@ -92,7 +92,7 @@ class RunLog:
             log.info("attached without a hook: the trainer runs as without D2")
             return
         cameras = ", ".join(map(str, getattr(None if prior is None else prior.store, "cameras", ())))
-        schedules = ", ".join(_schedule(name, hook) for name, hook in self.hooks.items())
+        schedules = ", ".join(_schedule(name, hook.config) for name, hook in self.hooks.items())
         log.info(
             "attached by %s to %d Gaussians; priors of cameras %s; %s",
             type(backbone).__name__, len(backbone), cameras or "unknown", schedules,
@@ -174,7 +174,7 @@ class RunLog:
 
     def _warn_of_default_schedules(self) -> None:
         known = [name for name, _ in self._stops() if name in HOOKS]
-        default = [name for name in known if self.hooks[name].window == HOOKS[name].config().window]
+        default = [n for n in known if _schedule(n, self.hooks[n].config) == _schedule(n, HOOKS[n].config())]
         if default:
             log.warning(
                 "%s: the length of the run is not known, and the default schedule ends at step %d: give iterations to "
@@ -183,7 +183,7 @@ class RunLog:
             )  # fmt: skip
 
     def _stops(self) -> Iterable[tuple[str, int]]:
-        return [(name, hook.window.stop) for name, hook in self.hooks.items() if hook.window.stop is not None]
+        return [(name, hook.config.stop) for name, hook in self.hooks.items() if hook.config.stop is not None]
 
 
 class _Mean:
@@ -232,19 +232,12 @@ class _StderrHandler(logging.Handler):
             sys.stderr.write(f"{line}\n")
 
 
-def _schedule(name: str, hook: Hook) -> str:
-    window = hook.window
-    until = "the end" if window.stop is None else f"{window.stop}"
-    return f"{name} {window.start} to {until}" + (f" every {window.every}" if window.every > 1 else "")
+def _schedule(name: str, config: HookConfig) -> str:
+    until = "the end" if config.stop is None else f"{config.stop}"
+    return f"{name} {config.start} to {until}" + (f" every {config.every}" if config.every > 1 else "")
 
 
 def _at_exit(run: RunLog) -> None:
     """Log the summary when the process ends, unless the run is gone by then."""
-    reference = weakref.ref(run)
-
-    def end() -> None:
-        alive = reference()
-        if alive is not None:
-            alive.end()
-
-    atexit.register(end)
+    end = weakref.WeakMethod(run.end)
+    atexit.register(lambda: alive() if (alive := end()) else None)

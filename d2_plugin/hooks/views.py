@@ -19,8 +19,7 @@ class ViewSampler:
 
     def __init__(self) -> None:
         self._views: dict[tuple[str, int], View] = {}
-        self._queues: dict[str, list[int]] = {}  # frames of a camera that its present round has still to come to
-        self._unseen: set[tuple[str, int]] = set()
+        self._looks: dict[tuple[str, int], int] = {}  # in how many samples each was
         self._next_camera = 0
         self._moving = False
 
@@ -32,14 +31,13 @@ class ViewSampler:
             poses = [known.T_camera_world for known in self.instants(view.camera)[:1]]
             self._moving |= not all(torch.equal(pose, view.T_camera_world) for pose in poses)
             self._views[view.camera, view.frame] = view
-            self._queues.setdefault(view.camera, []).append(view.frame)
-            self._unseen.add((view.camera, view.frame))
+            self._looks[view.camera, view.frame] = 0
         return new
 
     @property
     def unseen(self) -> int:
         """How many known views no sample had yet."""
-        return len(self._unseen)
+        return list(self._looks.values()).count(0)
 
     @property
     def cameras(self) -> int:
@@ -56,29 +54,24 @@ class ViewSampler:
         return [self._views.get((camera, view.frame), other) for camera, other in latest.items()]
 
     def sample(self, count: int, generator: torch.Generator) -> Sequence[View]:
-        """At most `count` different views; over several calls every known view comes once before any comes again."""
+        """At most `count` different views, in turn over cameras; of each camera one that was in fewest samples."""
         cameras = sorted({camera for camera, _ in self._views})
         chosen: dict[tuple[str, int], View] = {}
         for _ in range(count if cameras else 0):
             camera = cameras[self._next_camera % len(cameras)]
             self._next_camera += 1
-            key = (camera, self._next_frame(camera, generator))
-            chosen.setdefault(key, self._views[key])
-        self._unseen -= chosen.keys()
+            fewest = min(looks for (name, _), looks in self._looks.items() if name == camera)
+            keys = [key for key, looks in self._looks.items() if key[0] == camera and looks == fewest]
+            key = keys[int(torch.randint(len(keys), (1,), generator=generator))]
+            self._looks[key] += 1
+            chosen[key] = self._views[key]
         return list(chosen.values())
-
-    def _next_frame(self, camera: str, generator: torch.Generator) -> int:
-        queue = self._queues[camera]
-        if not queue:
-            queue += [frame for name, frame in self._views if name == camera]
-        return queue.pop(int(torch.randint(len(queue), (1,), generator=generator)))
 
     def state_dict(self) -> dict[str, Any]:
         """The known views and the position in their order; tensors and plain values only."""
         return {
             "views": [vars(view).copy() for view in self._views.values()],
-            "queues": {camera: list(queue) for camera, queue in self._queues.items()},
-            "unseen": sorted(self._unseen),
+            "looks": list(self._looks.values()),
             "next_camera": self._next_camera,
         }
 
@@ -87,6 +80,5 @@ class ViewSampler:
         self._views, self._moving = {}, False
         for view in state["views"]:
             self.add(View(**view))
-        self._queues = {camera: list(queue) for camera, queue in state["queues"].items()}
-        self._unseen = {(camera, frame) for camera, frame in state.get("unseen", ())}
+        self._looks = dict(zip(self._views, state.get("looks", [1] * len(self._views))))
         self._next_camera = state["next_camera"]

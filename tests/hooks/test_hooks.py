@@ -18,7 +18,7 @@ from tiny import ALL_HOOKS, HEIGHT, WIDTH, TinyStore, make_adapter, make_model, 
 from d2_plugin import hooks
 from d2_plugin.config import DensifyConfig, PruneConfig
 from d2_plugin.hooks.densify import Densify, back_project
-from d2_plugin.hooks.hook import Context, Window
+from d2_plugin.hooks.hook import Context, HookConfig
 from d2_plugin.hooks.prior import PriorLoader
 from d2_plugin.plugin import D2Hooks
 from d2_plugin.protocol import DepthPrior, Points, View
@@ -108,9 +108,10 @@ def test_the_first_evaluation_looks_through_every_camera_seen_so_far() -> None:
 
 
 @given(start=st.integers(0, 50), every=st.integers(1, 20), length=st.integers(0, 60))
-def test_a_window_is_due_at_its_start_and_every_so_often_until_its_stop(start: int, every: int, length: int) -> None:
-    window = Window(start, start + length, every)
-    assert [step for step in range(120) if window.due(step)] == [*range(start, start + length, every)]
+def test_a_hook_is_due_at_its_start_and_every_so_often_until_its_stop(start: int, every: int, length: int) -> None:
+    hook, due = HookConfig(start, start + length, every), [*range(start, start + length, every)]
+    assert [step for step in range(120) if hook.due(step)] == due
+    assert [hook.left(step) for step in (*due, 120)] == [*range(len(due), -1, -1)]
 
 
 @pytest.mark.parametrize("iterations", [1, 20, 40, 110, 500, 2000, 30_000])
