@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import functools
 import logging
-import math
 import os
 import threading
 import warnings
@@ -46,10 +45,6 @@ from d2_plugin.registry import ADAPTERS, load
 from d2_plugin.values import checked_arguments, fitting
 
 _log = logging.getLogger(__name__)
-
-MOST_VIEWS = 64
-"""Views of one evaluation, at most, of a recording that is long for its run: each should be looked at once while there
-is still insertion."""
 
 if hasattr(os, "register_at_fork"):
     # OpenMP's threads are not there after a fork, and a child that used them would wait for them for ever.
@@ -101,7 +96,6 @@ class D2Hooks:
         self._sampler = ViewSampler()
         self._finite = FiniteCheck(backbone, config.finite_every)
         self._order, self._used = StepOrder(), threading.Lock()
-        self._evaluated = False
         self._count = len(backbone)
         self._warned = self._idle_insert = False
         self._inserting = 0  # the step while the backbone inserts for us, else 0
@@ -253,7 +247,6 @@ class D2Hooks:
             "step": self._finite.step,
             "hooks": {name: hook.state_dict() for name, hook in self.hooks.items()},
             "views": self._sampler.state_dict(),
-            "evaluated": self._evaluated,
             "generator": self.generator.get_state(),
             "inserted_at": self.inserted_at.clone() if self.hooks else torch.zeros(len(self.backbone)).int(),
             "idle": dict(self._idle.evaluations),
@@ -270,7 +263,6 @@ class D2Hooks:
             self.generator.set_state(state["generator"].cpu())
             self._idle.load(state)
         self._order = StepOrder()
-        self._evaluated = bool(state.get("evaluated", True))
         self._count = len(self.backbone)
         self._finite.step = self._finite.saved = state.get("step", 0)
         self.inserted_at = state.get("inserted_at", torch.zeros(self._count, dtype=torch.int32)).cpu()
@@ -296,11 +288,8 @@ class D2Hooks:
 
     def _context(self, step: int, views: Sequence) -> Context:
         def sample() -> Sequence:
-            first = 0 if self._evaluated else self._sampler.cameras
-            self._evaluated = True
             left = self.hooks["densify"].config.left(now) if "densify" in self.hooks else 0
-            due = min(math.ceil(self._sampler.unseen / left), MOST_VIEWS) if left else 0
-            return self._sampler.sample(max(self.config.views_per_evaluation, first, due), self.generator)
+            return known.sample(max(self.config.views_per_evaluation, known.due(left)), self.generator)
 
         assert self.prior is not None, "a step without hooks has no context"
         now, known, motion = schedule_step(self.backbone, step), self._sampler, self.config.motion

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import sys
 import time
 from collections.abc import Iterator
@@ -68,16 +69,12 @@ def progress_bar(title: str, total: int) -> Iterator[Bar]:
     if _silent:
         yield _Nothing()
         return
-    try:
-        from rich.console import Console
-        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-    except ImportError:
+    if importlib.util.find_spec("rich") is None or not sys.stderr.isatty():
         yield _Lines(title, total)
         return
-    console = Console(stderr=True)
-    if not console.is_terminal:
-        yield _Lines(title, total)
-        return
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, TextColumn("{task.fields[note]}"), console=console) as progress:
+    with Progress(*columns, TextColumn("{task.fields[note]}"), console=Console(stderr=True)) as progress:
         yield _Rich(progress, progress.add_task(title, total=total, note=""))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -9,6 +10,9 @@ import torch
 
 from d2_plugin.hooks.expected import check_view
 from d2_plugin.protocol import View
+
+MOST = 64
+"""Views of one sample, at most, of a recording that is long for its run."""
 
 
 class ViewSampler:
@@ -34,15 +38,12 @@ class ViewSampler:
             self._looks[view.camera, view.frame] = 0
         return new
 
-    @property
-    def unseen(self) -> int:
-        """How many known views no sample had yet."""
-        return list(self._looks.values()).count(0)
-
-    @property
-    def cameras(self) -> int:
-        """How many cameras have been seen so far."""
-        return len({camera for camera, _ in self._views})
+    def due(self, left: float) -> int:
+        """How many views to sample at least: one of each camera at first, and as many as it takes to come to all of
+        them in `left` samples, up to `MOST`."""
+        unseen = list(self._looks.values()).count(0)
+        first = len({camera for camera, _ in self._views}) if unseen == len(self._views) else 0
+        return max(first, min(math.ceil(unseen / left), MOST) if left else 0)
 
     def instants(self, camera: str) -> list[View]:
         """The known views of one camera, in the order in which they were first seen."""
