@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
@@ -56,6 +58,16 @@ class TinyStore:
         labels[:, WIDTH // 2] = Label.CONFLICT
         depth = torch.where(labels == Label.CONFLICT, 0.0, DISTANCE)
         return DepthPrior(depth, labels, torch.full((HEIGHT, WIDTH, 3), 128, dtype=torch.uint8))
+
+
+class ChangedStore(TinyStore):
+    """The tiny prior with something about it changed."""
+
+    def __init__(self, change: Callable[[DepthPrior], object]) -> None:
+        self.change = change
+
+    def prior(self, camera: str, frame: int) -> object:
+        return self.change(super().prior(camera, frame))
 
 
 def make_model(

@@ -1,14 +1,13 @@
 """Stiff cases 18 to 41 of depth and of a training step with hooks: empty masks, numbers that leave their range."""
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from tiny import BACKBONES, DISTANCE, TinyFrames, TinyStore, bend_field, make_adapter, make_model, make_views
+from tiny import BACKBONES, DISTANCE, ChangedStore, TinyFrames, bend_field, make_adapter, make_model, make_views
 
 from d2_plugin import D2Config, D2Hooks
 from d2_plugin.backbones.model import SplatModel
@@ -28,32 +27,15 @@ def model(request: pytest.FixtureRequest) -> SplatModel:
     return bend_field(make_model(backbone=request.param))
 
 
-class Store:
-    """A prior made by a function of the exact depth and the labels of `TinyStore`."""
+def unlabelled(label: Label, bad: float = DISTANCE) -> ChangedStore:
+    """The exact depth, every pixel labelled alike; a quarter of the depths may be bad."""
 
-    def __init__(self, change: Callable[[torch.Tensor, torch.Tensor], tuple[torch.Tensor, torch.Tensor]]) -> None:
-        self.change = change
-
-    def prior(self, camera: str, frame: int) -> DepthPrior:
-        exact = TinyStore().prior(camera, frame)
-        depth, labels = self.change(exact.depth.clone(), exact.labels.clone())
-        return DepthPrior(depth, labels, exact.colors)
-
-
-def unlabelled(label: Label, distance: float = DISTANCE) -> Store:
-    """One depth, by default the exact one, every pixel labelled alike."""
-    return Store(lambda depth, labels: (torch.full_like(depth, distance), torch.full_like(labels, int(label))))
-
-
-def with_bad_pixels(bad: float) -> Store:
-    """Everything verified, a quarter of the depths replaced."""
-
-    def change(depth: torch.Tensor, labels: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        depth = torch.full_like(depth, DISTANCE)
+    def change(prior: DepthPrior) -> DepthPrior:
+        depth = torch.full_like(prior.depth, DISTANCE)
         depth[:12, :16] = bad
-        return depth, torch.full_like(labels, int(Label.VERIFIED))
+        return prior._replace(depth=depth, labels=torch.full_like(prior.labels, int(label)))
 
-    return Store(change)
+    return ChangedStore(change)
 
 
 def gradients(model: SplatModel) -> dict[str, torch.Tensor]:
@@ -124,9 +106,9 @@ def test_case_26_the_charbonnier_penalty_is_finite_over_the_range_of_float32(res
 def test_case_27_bad_pixels_of_a_prior_reach_neither_loss_nor_gradient(model: SplatModel, bad: float) -> None:
     adapter, view = make_adapter(model), make_views()[0]
     losses = []
-    for store in (with_bad_pixels(bad), with_bad_pixels(0.0)):
+    for depth in (bad, 0.0):
         model.render(view)
-        loss = D2Hooks(DEPTH_LOSS, adapter, store).loss(1, view)
+        loss = D2Hooks(DEPTH_LOSS, adapter, unlabelled(Label.VERIFIED, depth)).loss(1, view)
         loss.backward()
         assert torch.isfinite(loss)
         assert all(torch.isfinite(gradient).all() for gradient in gradients(model).values())
@@ -190,7 +172,7 @@ def test_case_36_an_empty_scene_is_filled_within_the_budget_from_depths_that_are
     config = D2Config(
         densify=DensifyConfig(start=1, every=1, budget_per_view=20, max_gaussians=70), views_per_evaluation=6
     )
-    d2 = D2Hooks(config, make_adapter(model), with_bad_pixels(bad))
+    d2 = D2Hooks(config, make_adapter(model), unlabelled(Label.VERIFIED, bad))
     for view in make_views():
         d2.loss(1, view)
     report = d2.step(2)

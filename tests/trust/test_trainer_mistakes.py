@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 import torch
 from refusals import refuses
-from tiny import ALL_HOOKS, TinyStore, make_adapter, make_model, make_views
+from tiny import ALL_HOOKS, ChangedStore, TinyStore, make_adapter, make_model, make_views
 from torch import Tensor
 
 from d2_plugin.adapters.yang4d import Yang4DAdapter
@@ -26,16 +26,6 @@ from d2_plugin.plugin import D2Hooks
 from d2_plugin.protocol import DepthPrior, Splats
 
 VIEWS = make_views()
-
-
-class ChangedStore(TinyStore):
-    """The tiny prior with something about it changed."""
-
-    def __init__(self, change: Callable[[DepthPrior], object]) -> None:
-        self.change = change
-
-    def prior(self, camera: str, frame: int) -> object:
-        return self.change(super().prior(camera, frame))
 
 
 def hooks(store: object = None, config: D2Config = ALL_HOOKS, adapter: object = None) -> D2Hooks:
@@ -267,13 +257,12 @@ def test_hooks_are_not_copied(copied: Callable) -> None:
 def test_two_threads_at_once_are_refused() -> None:
     inside, go_on = threading.Event(), threading.Event()
 
-    class Waiting(TinyStore):
-        def prior(self, camera: str, frame: int) -> DepthPrior:
-            inside.set()
-            go_on.wait(20)
-            return super().prior(camera, frame)
+    def waiting(prior: DepthPrior) -> DepthPrior:
+        inside.set()
+        go_on.wait(20)
+        return prior
 
-    d2 = hooks(Waiting())
+    d2 = hooks(ChangedStore(waiting))
     first = threading.Thread(target=d2.loss, args=(1, VIEWS[0]))
     first.start()
     assert inside.wait(20)
