@@ -3,7 +3,9 @@
 import logging
 import math
 import tomllib
+from collections import defaultdict
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from mimics import fudan
@@ -51,23 +53,17 @@ def test_the_printed_lines_say_what_happens_and_keep_their_distance(pause: float
 
 
 def test_a_callback_and_a_writer_get_every_change() -> None:
-    class Writer:
-        def __init__(self) -> None:
-            self.scalars: dict[str, list[tuple[int, float]]] = {}
-
-        def add_scalar(self, tag: str, value: float, step: int) -> None:
-            self.scalars.setdefault(tag, []).append((step, value))
-
     reports: list[Report] = []
-    writer = Writer()
+    scalars: dict[str, list[tuple[int, float]]] = defaultdict(list)
+    writer = SimpleNamespace(add_scalar=lambda tag, value, step: scalars[tag].append((step, value)))
     trainer = logged(ALL_HOOKS, on_report=reports.append, writer=writer)
     trainer.run(29)
-    assert writer.scalars["d2/gaussians"][-1][1] == len(trainer.model)
+    assert scalars["d2/gaussians"][-1][1] == len(trainer.model)
     trainer.run()
     assert [report.step for report in reports] == list(range(1, 31))
     assert sum(report.inserted for report in reports) == trainer.d2.log.inserted > 0
-    assert [step for step, _ in writer.scalars["d2/depth_loss"]] == [10, 20, 30]
-    assert all(value > 0 for _, value in writer.scalars["d2/depth_loss"])
+    assert [step for step, _ in scalars["d2/depth_loss"]] == [10, 20, 30]
+    assert all(value > 0 for _, value in scalars["d2/depth_loss"])
 
 
 def test_a_camera_without_prior_is_warned_of_once_with_those_that_have_one(caplog) -> None:

@@ -4,6 +4,7 @@ import re
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -237,11 +238,8 @@ def test_each_violation_gets_its_sentence(change: Callable[[WatchedModel], None]
 
 
 def test_members_that_are_missing_are_named_first() -> None:
-    class Nothing:
-        settings = RasterSettings()
-
     with pytest.raises(ContractError, match=r"the backbone has no slice_at\(\)"):
-        check_backbone(lambda: Example(Nothing(), make_views()))
+        check_backbone(lambda: Example(SimpleNamespace(settings=RasterSettings()), make_views()))
 
 
 def test_a_state_that_forgets_something_is_noticed() -> None:

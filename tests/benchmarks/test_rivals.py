@@ -3,6 +3,7 @@
 import json
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -22,7 +23,6 @@ from d2_plugin import D2Config, D2Hooks
 from d2_plugin.errors import D2Error
 from d2_plugin.hooks import Context, Hook, HookConfig
 from d2_plugin.hooks.prior import PriorLoader
-from d2_plugin.protocol import View
 from d2_plugin.runs.ablation.ablate import ablate
 from d2_plugin.runs.ablation.presets import PRESETS, rows_named
 from d2_plugin.runs.rows import read_rows
@@ -136,13 +136,6 @@ def test_where_nothing_can_be_told_there_is_no_gradient(name: str, dtype: torch.
     assert (d.grad == 0).all()
 
 
-class OneMap:
-    """What `Inputs` knows of depth: a slope."""
-
-    def inverse_depth(self, view: View) -> Tensor:
-        return torch.linspace(1, 2, view.width).expand(view.height, -1)
-
-
 @pytest.mark.parametrize("backbone", BACKBONES)
 @pytest.mark.parametrize(
     ("soft_start", "wanted"), [(10, {"positions"}), (0, {"positions", "opacity_logits"})], ids=["hard", "and soft"]
@@ -152,7 +145,8 @@ def test_hard_depth_moves_centres_and_soft_depth_fades_gaussians_and_nothing_els
 ) -> None:
     """DNGaussian's code freezes all but positions for one term, and all but opacities for the other."""
     adapter = make_adapter(make_model(backbone=backbone))
-    hook = PatchNorm(PatchNormConfig(soft_start=soft_start), OneMap())
+    slope = SimpleNamespace(inverse_depth=lambda view: torch.linspace(1, 2, view.width).expand(view.height, -1))
+    hook = PatchNorm(PatchNormConfig(soft_start=soft_start), slope)
     context = Context(5, adapter, make_views()[:1], PriorLoader(TinyStore()), torch.Generator().manual_seed(0))
     loss = hook.loss(context)
     loss.backward()

@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -155,14 +156,9 @@ def test_pixels_between_two_surfaces_are_dropped_and_plain_walls_are_kept(noise:
     wrong, right = np.abs(mixed - truth) > 0.05 * truth, np.abs(mixed - truth) < 0.03 * truth
     measured = mixed * (1 + np.random.default_rng(0).normal(0, noise, truth.shape)).astype(np.float32)
 
-    class Measured:
-        name, about = "sensor", "a sensor"
-
-        def depth(self, camera: Camera, frame: int) -> np.ndarray:
-            return measured
-
+    sensor = SimpleNamespace(name="sensor", about="a sensor", depth=lambda camera, frame: measured)
     blank = Frame(0, {camera.name: np.full((180, 320, 3), 128, np.uint8)}, {camera.name: ""})
-    depth = DepthOnDisk(Measured(), [camera], None, AUTO, tmp_path).depths(blank)[camera.name].depth
+    depth = DepthOnDisk(sensor, [camera], None, AUTO, tmp_path).depths(blank)[camera.name].depth
     assert wrong.sum() > 300
     assert (depth[wrong] > 0).mean() < 0.02
     assert (depth[right] > 0).mean() > 0.95
