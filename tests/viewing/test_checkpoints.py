@@ -154,7 +154,6 @@ class Test4DGaussians:
     def output(folder: Path, **changed: Any) -> dict[str, Tensor]:
         """What its train.py leaves: the coarse stage at 3000 iterations, the fine one at 14000."""
         model = official.inria_columns(40)
-        model |= dict(zip(("_scaling", "_rotation", "_opacity"), official.RAW)) if changed.pop("few", False) else {}
         for stage in ("coarse_iteration_3000", "iteration_14000"):
             place = folder / "point_cloud" / stage
             official.write_inria_ply(place / "point_cloud.ply", model)
