@@ -157,20 +157,14 @@ def test_a_flipped_bit_of_an_archive_is_seen_before_anybody_reads_it(tmp_path: P
         pass
 
 
-def test_a_second_writer_is_refused_with_one_sentence_until_the_first_ends(tmp_path: Path) -> None:
-    with only_writer(tmp_path), pytest.raises(Busy, match="another process is writing .*: wait until it has ended"):
-        only_writer(tmp_path).__enter__()
-    with only_writer(tmp_path):
-        pass
-    assert list(tmp_path.iterdir()) == [], "a lock is no file"
-
-
 def test_many_may_write_beside_each_other_and_the_first_tidies(tmp_path: Path) -> None:
     tidied = []
     first, second = (one_of_many(tmp_path, lambda number=number: tidied.append(number)) for number in (1, 2))
     with first, second, pytest.raises(Busy):
         only_writer(tmp_path).__enter__()
     assert tidied == [1]
+    with only_writer(tmp_path):
+        assert list(tmp_path.iterdir()) == [], "a lock is no file"
 
 
 def test_turns_are_taken_one_after_the_other(tmp_path: Path) -> None:
