@@ -226,7 +226,6 @@ def run(table: dict[str, Any]) -> RunSettings:
     ("read", "table", "sentence"),
     [
         (D2Config.from_dict, {"view_per_evaluation": 3}, r"unknown setting 'view_per.*did you mean 'views_per_eval"),
-        (D2Config.from_dict, {"version": 2}, r"the configuration has settings of version 2, and this d2-4dgs reads"),
         (deform.settings_from, {"hexplane": {"resolutions": []}}, r"resolutions has 0 levels: give one to eight"),
         (deform.settings_from, {"hexplane": {"resolutions": [1] * 9}}, r"resolutions has 9 levels: give one to eight"),
         (PriorSettings.from_dict, {"depth_range": [9.0, 1.0]}, "0 < near < far"),

@@ -93,8 +93,6 @@ class TestWords:
             (["--train-cameras", "cam00,cam00"], "cam00 is named twice: name each once, for training or for test"),
             (["--mono-onnx", "net.onnx"], "--mono-kind"),
             (["--device", "cdua"], "cuda"),
-            (["--mono-kind", "metrical"], "did you mean 'metric'"),
-            (["--budget-per-view", "5"], "did you mean --densify.budget-per-view?"),
             (["--downscale", "60000"], "leaves no pixel"),
             (["--iterations", "9" * 30], "--iterations must be at least 1 and at most 1e+09"),
             (["--depth-loss.weight", "1e308"], "--depth-loss.weight must be"),

@@ -62,7 +62,6 @@ def test_depth_labels_sigma_and_colours_come_back(store: PriorStore) -> None:
 def test_a_view_that_was_not_built_is_none(store: PriorStore) -> None:
     assert store.prior("a", 3) is None
     assert store.record("b", 3) is None
-    refuses("unknown camera of the prior store 'c'", store.prior, "c", 0)
 
 
 @given(st.floats(1e-3, 1e3), st.floats(1, 1e9), st.integers(0, 10**6))
