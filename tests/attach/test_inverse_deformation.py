@@ -80,9 +80,3 @@ def test_the_nearest_gaussian_lends_its_offset_even_far_from_the_origin(count: i
     exact = torch.cdist(targets_of().double(), (means - shift).double(), compute_mode="donot_use_mm_for_euclid_dist")
     lent = neighbour_offsets(targets_of() + shift, means, offsets)
     assert (lent == offsets[exact.argmin(1)]).all(1).float().mean() > 0.97
-
-
-def test_no_points_are_inverted_to_no_points() -> None:
-    inversion = invert_deformation(smooth, NOBODY, targets_of(4), targets_of(4), tolerance=1.0)
-    assert inversion.positions.shape == (0, 3)
-    assert inversion.accepted.shape == (0,)
