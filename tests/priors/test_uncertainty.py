@@ -283,12 +283,6 @@ def test_a_line_that_turns_around_without_a_third_says_nothing_beyond() -> None:
     assert np.isinf(told[truth > 8]).all()
 
 
-def test_without_anchors_there_is_nothing_to_say() -> None:
-    nothing = np.zeros((9, 16))
-    assert (extrapolation_error(np.ones((9, 16)), nothing, "relative", SETTINGS) == 0).all()
-    assert (extrapolation_error(nothing, np.ones((9, 16)), "relative", SETTINGS) == 0).all()
-
-
 def test_the_declared_sigma_contains_it() -> None:
     aligned, anchors, truth = bent_scene("relative", 0.1)
     sigma = monocular_uncertainty(aligned, anchors, SETTINGS).sigma
