@@ -58,7 +58,7 @@ class D2Config(_HookTables):
     """Steps of the trainer's run: what the hooks' tables leave out of start, stop, every and budget follows from it."""
     views_per_evaluation: Annotated[int, Range(1, 10_000)] = 8
     """Training views surveyed at each structure update, taken in turn over all cameras and frames; at the first one at
-    least one of each camera seen so far, and more, up to 64, where insertion would else end before all were."""
+    least one of each camera seen so far, and more, up to 64, where not all would have been when insertion ends."""
     retire_after: Count = 5
     """A structure hook retires after this many evaluations in a row that change next to nothing (less than a thousandth
     of the Gaussians); 0: never."""

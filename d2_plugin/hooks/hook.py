@@ -48,7 +48,7 @@ class HookConfig(Settings):
         return self.start <= step and (self.stop is None or step < self.stop) and (step - self.start) % self.every == 0
 
     def left(self, step: int) -> float:
-        """How often it is due from `step` on; infinite where it runs to the end, 0 after it."""
+        """How often it is due from `step` on, if it is then; infinite where it runs to the end, 0 after it."""
         return math.inf if self.stop is None else max(0, -(-(self.stop - step) // self.every))
 
 

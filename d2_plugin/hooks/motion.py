@@ -56,7 +56,7 @@ class MotionConfig(HookConfig):
 
 
 class Motion(ImageHook):
-    """Adds the photometric loss between each view of the present step and the same camera's next instant."""
+    """Adds the photometric loss on the way from each view of the step to its camera's next instant, and at others."""
 
     config: MotionConfig
 
