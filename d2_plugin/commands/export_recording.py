@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
+from d2_plugin.protocol import EXPORT_FILE
+from d2_plugin.reading import read_json
 from d2_plugin.recordings import Recording, open_recording, select_cameras
 from d2_plugin.recordings.export.export import export_recording
 from d2_plugin.recordings.export.ply import PointCloud
@@ -45,10 +47,11 @@ def run(settings: RecordingExport) -> str:
     train = settings.train_cameras or tuple(name for name in recording.cameras if name not in held_out)
     recording = select_cameras(recording, [*train, *(name for name in held_out if name not in train)])
     cloud = start_cloud(recording, train, settings.points, settings.seed) if settings.points > 0 else None
-    export_recording(recording, settings.format, settings.output, test_cameras=held_out, cloud=cloud)
+    folder = export_recording(recording, settings.format, settings.output, test_cameras=held_out, cloud=cloud)
+    written = read_json(folder / EXPORT_FILE, "export again")
     points = "no" if cloud is None else len(cloud.positions)
-    written = f"{len(recording.cameras)} cameras, {len(recording.frames)} frames, {points} initial points"
-    return f"{written} in {settings.output} ({settings.format})"
+    what = f"{len(written['cameras'])} cameras, {len(written['frames'])} frames, {points} initial points"
+    return f"{what} in {settings.output} ({settings.format})"
 
 
 def start_cloud(recording: Recording, cameras: Sequence[str], minimum: int = MIN_POINTS, seed: int = 0) -> PointCloud:

@@ -35,14 +35,18 @@ Reading = Callable[[str], Optional[Shot]]  # noqa: UP045  at run time, on Python
 """One way to read a name; None for a name that does not say both camera and frame."""
 
 
-def numbered_files(folder: Path, suffixes: Iterable[str] = IMAGE_SUFFIXES) -> FrameFiles:
+def is_called(path: Path, suffixes: Collection[str] = IMAGE_SUFFIXES) -> bool:
+    """Whether a file is called like an image; hidden ones, which macOS puts beside each file, are not."""
+    return path.suffix.lower() in suffixes and not path.name.startswith(".")
+
+
+def numbered_files(folder: Path, suffixes: Collection[str] = IMAGE_SUFFIXES) -> FrameFiles:
     """Frame number -> file for everything in `folder` with one of `suffixes`; the last number in a name counts.
 
     Raises `D2Error` for a file without a number and for two files of one frame (1.png beside 00001.jpg).
     """
-    wanted = tuple(suffixes)
     files: FrameFiles = {}
-    for path in sorted(path for path in folder.iterdir() if path.suffix.lower() in wanted):
+    for path in sorted(path for path in folder.iterdir() if is_called(path, suffixes)):
         number = _LAST_NUMBER.search(path.stem)
         if number is None:
             raise D2Error(f"{path} has no frame number in its name: name it like 00012{path.suffix}")
@@ -53,8 +57,15 @@ def numbered_files(folder: Path, suffixes: Iterable[str] = IMAGE_SUFFIXES) -> Fr
     return files
 
 
+def camera_folders(folder: Path) -> dict[str, Path]:
+    """The folders in `folder` that hold images, by their names; hidden ones are no cameras."""
+    inside = sorted(folder.iterdir()) if folder.is_dir() else []
+    shown = (one for one in inside if one.is_dir() and not one.name.startswith("."))
+    return {one.name: one for one in shown if any(map(is_called, one.iterdir()))}
+
+
 def files_by_camera(
-    folder: Path, cameras: Iterable[str], suffixes: Iterable[str] = IMAGE_SUFFIXES
+    folder: Path, cameras: Iterable[str], suffixes: Collection[str] = IMAGE_SUFFIXES
 ) -> dict[str, FrameFiles]:
     """`numbered_files` of each camera that has a folder of its name in `folder`."""
     return {name: numbered_files(folder / name, suffixes) for name in cameras if (folder / name).is_dir()}
@@ -149,7 +160,8 @@ def images_below(folder: Path) -> dict[str, Path]:
     """Every image under `folder` by its path relative to it, sorted."""
     if not folder.is_dir():
         raise D2Error(f"{folder} is no folder: expected the images of the recording there")
-    paths = sorted(path for path in folder.rglob("*") if path.suffix.lower() in IMAGE_SUFFIXES)
+    linked = (path for path in folder.iterdir() if path.is_symlink() and path.is_dir())  # `rglob` follows no links
+    paths = sorted(path for place in (folder, *linked) for path in place.rglob("*") if is_called(path))
     return {path.relative_to(folder).as_posix(): path for path in paths}
 
 

@@ -26,7 +26,7 @@ VALID_FOLDER = "valid"  # valid/<camera>.png is black where nothing was recorded
 MOST_PIXELS = 1 << 28  # larger images are refused before anything is decoded: 16384 x 16384
 
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-_PNG_RGBA = 6  # colour type in the header's byte 25
+_WITH_OPACITY = (b"\4", b"\6")  # colour types in the header's byte 25: grey and RGB, each with opacity
 _HEAD = 1 << 22  # bytes in which the size of an image stands; profiles of a JPEG may come before it
 _REMEDY = "replace the file or leave this frame out"
 _JPEG_SIZE_MARKERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # SOF0..15 without DHT, JPG, DAC
@@ -48,11 +48,12 @@ def read_image(path: Path) -> np.ndarray:
     """
     cv2 = opencv("reading images")
     encoded = _whole(path)
-    transparent = encoded.startswith(_PNG_SIGNATURE) and len(encoded) > 25 and encoded[25] == _PNG_RGBA
+    one_colour = encoded[25:26] != b"\0" and b"tRNS" in encoded[: encoded.find(b"IDAT")]  # or some, of a palette
+    transparent = encoded.startswith(_PNG_SIGNATURE) and (encoded[25:26] in _WITH_OPACITY or one_colour)
     # The calibration belongs to the stored pixels: EXIF's orientation is ignored, as IMREAD_UNCHANGED does too.
     flags = cv2.IMREAD_UNCHANGED if transparent else cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
     image = _decoded(path, encoded, flags)
-    return _over_black(image) if transparent else cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+    return _over_black(image) if image.shape[2] == 4 else cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
 def checked_image(image: object, what: str) -> np.ndarray:
@@ -80,11 +81,12 @@ def write_png(path: Path, image: np.ndarray) -> None:
 
 
 def read_mask(path: Path) -> np.ndarray:
-    """An image of any number of channels as one number per pixel, 0..1: its opacity where it has one."""
+    """An image of any number of channels as one number per pixel, 0..1: its opacity where not all is opaque."""
     stored = read_numbers(path)
     full = float(np.iinfo(stored.dtype).max) if np.issubdtype(stored.dtype, np.integer) else 1.0
     if stored.ndim == 3:
-        stored = stored[..., 3] if stored.shape[2] == 4 else stored.max(axis=2)
+        cut_out = stored.shape[2] == 4 and stored[..., 3].min() < full
+        stored = stored[..., 3] if cut_out else stored[..., :3].max(axis=2)
     return (stored.astype(np.float32) / np.float32(full)).clip(0, 1)
 
 
@@ -196,10 +198,7 @@ def _jpeg_size(path: Path, data: bytes) -> tuple[int, int]:
         if marker in _JPEG_SIZE_MARKERS:
             height, width = struct.unpack(">HH", data[position + 5 : position + 9])
             return width, height
-        if marker == 0xFF:  # fill byte before a marker
-            position += 1
-        else:
-            position += 2 + length
+        position += 1 if marker == 0xFF else 2 + length  # a fill byte, or a whole segment
     raise _unreadable(path)
 
 

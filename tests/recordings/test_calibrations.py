@@ -13,17 +13,7 @@ import zlib  # noqa: F401  (pycolmap brings a zlib of its own that must not come
 
 pytest.importorskip("pycolmap", reason="pycolmap is in the `calibration` extra")
 
-from calibration_writers import (
-    CASES,
-    Known,
-    anipose,
-    easymocap,
-    in_first_camera,
-    panoptic,
-    pose2sim,
-    rig,
-    transforms,
-)
+from calibration_writers import CASES, Known, anipose, easymocap, in_first_camera, panoptic, pose2sim, rig, transforms
 from refusals import refuses
 
 from d2_plugin.errors import D2Error
@@ -141,6 +131,8 @@ def file_with(name: str, content: bytes) -> Callable[[Path], Path]:
 
 
 UNPLACED = b"[cameras.0]\ncam_id = 0\nsize = [4, 4]\nmatrix = [[4.0, 0, 2], [0, 4, 2], [0, 0, 1]]\n"
+PLACED = UNPLACED + b"rotation = [0, 0, 0]\ntranslation = [0, 0, 0]\n"
+TRANSPOSED = b'{"frames": [{"file_path": "a", "transform_matrix": [1,0,0,0, 0,1,0,0, 0,0,1,0, 7,8,9,1]}]}'
 NO_UNDISTORTION = "cam0 .* model {}, .*pinhole-equi or pinhole-radtan"
 
 
@@ -152,6 +144,8 @@ NO_UNDISTORTION = "cam0 .* model {}, .*pinhole-equi or pinhole-radtan"
         (lambda path: path / "b.json", "no such calibration"),
         (file_with("a.yaml", b"a: &a [1]\ncam0: *a\n"), "has YAML aliases"),
         (file_with("a.toml", UNPLACED), "cam_0 .* has no rotation and no translation: Caliscope could not place it"),
+        (file_with("a.toml", PLACED.replace(b"0, 1]", b"0, 2]")), "camera cam_0 .* has a K that is not fx skew cx, 0"),
+        (file_with("a.json", TRANSPOSED), r"ends with the row \[7.0, 8.0, 9.0, 1.0\], expected 0 0 0 1"),
         (kalibr_with("pinhole", "omni"), NO_UNDISTORTION.format("omni")),
         (kalibr_with("radtan", "fov"), NO_UNDISTORTION.format("fov")),
     ],

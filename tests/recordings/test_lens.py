@@ -93,7 +93,7 @@ def test_the_share_of_black_pixels_is_measured() -> None:
     wide = refuse_black(of(Lens(K, "opencv", (0.4,))))
     x, y = np.moveaxis(Lens(K, "opencv", (0.4,)).recorded_pixels(centres()), -1, 0)
     exact = 1 - ((x >= 0) & (x <= SIZE[0]) & (y >= 0) & (y <= SIZE[1])).mean()
-    assert wide == pytest.approx(exact, abs=0.05)
+    assert wide == pytest.approx(exact, abs=1e-9)
 
 
 def test_a_lens_that_leaves_hardly_anything_of_a_image_is_refused(tmp_path: Path) -> None:

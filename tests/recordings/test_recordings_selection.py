@@ -48,8 +48,7 @@ def test_a_image_rotated_by_its_metadata_keeps_the_stored_pixel_order(tmp_path: 
     cv2.imwrite(str(path), np.zeros((20, 30, 3), np.uint8))
     data = path.read_bytes()
     orientation = struct.pack("<HHHII", 1, 0x0112, 3, 1, 6)  # by 90 degrees
-    tiff = b"II*\x00\x08\x00\x00\x00" + orientation + bytes(4)
-    body = b"Exif\x00\x00" + tiff
+    body = b"Exif\x00\x00" + b"II*\x00\x08\x00\x00\x00" + orientation + bytes(4)
     path.write_bytes(data[:2] + b"\xff\xe1" + struct.pack(">H", len(body) + 2) + body + data[2:])
     assert read_image(path).shape == (20, 30, 3)
 

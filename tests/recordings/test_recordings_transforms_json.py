@@ -102,6 +102,11 @@ def test_a_transparent_image_is_laid_over_black(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_image(tmp_path / "a.png"), expected)
     cv2.imwrite(str(tmp_path / "b.png"), rgba.astype(np.uint16) * 257)
     np.testing.assert_array_equal(read_image(tmp_path / "b.png"), expected)
+    pillow = pytest.importorskip("PIL.Image")
+    pillow.fromarray(np.array([[[100, 255], [100, 51]]], np.uint8)).save(tmp_path / "grey.png")
+    np.testing.assert_array_equal(read_image(tmp_path / "grey.png")[0, :, 0], [100, 20])
+    pillow.fromarray(rgba[..., :3]).save(tmp_path / "one.png", transparency=(10, 100, 200))
+    assert not read_image(tmp_path / "one.png").any()
 
 
 def test_missing_images_are_named_and_left_out_only_when_asked(tmp_path: Path) -> None:

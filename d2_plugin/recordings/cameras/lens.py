@@ -76,10 +76,12 @@ def checked_lens(K: np.ndarray, model: str, distortion: np.ndarray | tuple[float
     """A `Lens`, whose coefficients are those of its model.
 
     Raises:
-        D2Error: an unknown model, a coefficient that no lens has, or one that the model has no place for, as of thin
-            prism and tilted models.
+        D2Error: no K, an unknown model, a coefficient that no lens has, or one that the model has no place for, as of
+            thin prism and tilted models.
     """
     refuse_unknown(f"camera model of {where}", [model], MODELS)
+    if not np.allclose((K[1, 0], *K[2]), (0, 0, 0, 1)):
+        raise D2Error(f"{where} has a K that is not fx skew cx, 0 fy cy, 0 0 1: correct the calibration")
     values = np.ravel(np.asarray(distortion, np.float64))
     if not (np.abs(values) <= LARGEST_COEFFICIENT).all():
         raise D2Error(

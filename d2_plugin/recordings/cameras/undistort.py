@@ -19,7 +19,7 @@ from d2_plugin.recordings.recording import Camera, Source
 from d2_plugin.values import checked_arguments
 
 KEPT_MAPS = 8  # cameras whose resampling map stays in memory (6 bytes per pixel each)
-COVERAGE_STEP = 8  # grid step in pixels, across and down, for measuring how much of an image is black
+COVERAGE = 200  # places across and down, at most, at which it is measured how much of an image is black
 MOST_BLACK = 0.5  # share of an undistorted image that may be without a recorded pixel: more is a wrong coefficient
 
 
@@ -132,7 +132,9 @@ def refuse_black(camera: CalibratedCamera) -> float:
     Raises:
         D2Error: its lens leaves hardly anything of them.
     """
-    places = camera.lens.recorded_pixels(_centres(camera.width, camera.height, COVERAGE_STEP))
+    columns, rows = (min(side, COVERAGE) for side in camera.size)
+    grid = _centres(columns, rows) * (camera.width / columns, camera.height / rows)
+    places = camera.lens.recorded_pixels(grid)
     share = 1 - float(((places >= 0) & (places <= (camera.width, camera.height))).all(axis=-1).mean())
     if share > MOST_BLACK:
         raise D2Error(
@@ -142,6 +144,6 @@ def refuse_black(camera: CalibratedCamera) -> float:
     return share
 
 
-def _centres(width: int, height: int, step: int = 1) -> np.ndarray:
-    """Every `step`-th pixel's centre [h, w, 2]."""
-    return np.stack(np.meshgrid(np.arange(0, width, step) + 0.5, np.arange(0, height, step) + 0.5), axis=-1)
+def _centres(columns: int, rows: int) -> np.ndarray:
+    """The centre of every pixel [rows, columns, 2]."""
+    return np.stack(np.meshgrid(np.arange(columns) + 0.5, np.arange(rows) + 0.5), axis=-1)

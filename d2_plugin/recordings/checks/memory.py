@@ -18,10 +18,9 @@ SCALES = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64)  # what is proposed for `--down
 
 def needed_bytes(recording: Recording, cameras: Sequence[str], downscale: int = 1) -> int:
     """Estimate of the peak memory of priors and training on the named cameras, all of one instant at a time."""
-    sizes = [
-        (recording.cameras[name].width // downscale, recording.cameras[name].height // downscale) for name in cameras
-    ]
-    return BASE_BYTES + BYTES_PER_PIXEL * sum(width * height for width, height in sizes)
+    chosen = [recording.cameras[name] for name in cameras]
+    pixels = sum((camera.width // downscale) * (camera.height // downscale) for camera in chosen)
+    return BASE_BYTES + BYTES_PER_PIXEL * pixels
 
 
 def available_bytes() -> int | None:

@@ -33,11 +33,9 @@ def write_n3dv(export: Export) -> Written:
         refuse_off_centre(camera, "n3dv")
     _say_what_is_lost(list(cameras.values()), len(export.recording.frames))
     names = sorted_names([*export.test_cameras, *export.train_cameras], len(export.test_cameras))
-    for name in cameras:
-        images = export.folder / names[name] / "images"
-        images.mkdir(parents=True)
-        (export.folder / "frames").mkdir(exist_ok=True)
-        (export.folder / "frames" / names[name]).symlink_to(Path("..") / names[name] / "images")
+    (export.folder / "frames").mkdir()
+    for name in names.values():
+        (export.folder / "frames" / name).symlink_to(Path("..") / name / "images")
     # Deformable-3D-Gaussians knows an image by its file's name alone, so that has to name the camera, too.
     export.write_images(
         lambda camera, frame: export.folder / names[camera] / "images" / f"{names[camera]}_{frame:04d}.png"

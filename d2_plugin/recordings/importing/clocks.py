@@ -101,6 +101,8 @@ def given_clock(videos: Mapping[str, VideoFile], given: Sequence[str]) -> dict[s
         D2Error: what is no number, and cameras that there are not.
     """
     expected = f"{', '.join(METHODS)}, or NAME=FRAMES such as {next(iter(videos))}=-7.5"
+    if given and not any("=" in text for text in given):  # one number for all would move none
+        raise D2Error(f"--offsets says '{','.join(given)}', expected {expected}: correct it")
     starts = by_camera("--offsets", given, videos, finite, expected)
     return {name: Clock(starts.get(name, 0.0) / (video.rate or 25.0), 0.0, "given") for name, video in videos.items()}
 

@@ -143,7 +143,7 @@ def _known_rig(
     wrong, mends, said = _contradiction(turned, cameras) if len(cameras) > 1 else (False, False, "")
     doubt = ""
     if wrong and not settings.accept_calibration:
-        doubt = f"{calibration} does not fit the videos: {said}; or give --accept-calibration"
+        doubt = f"{calibration} does not fit the videos: {'; '.join((*more, said))}; or give --accept-calibration"
         if not (mends and settings.refine_poses):
             raise D2Error(doubt)
     elif said:

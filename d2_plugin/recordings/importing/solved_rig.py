@@ -23,6 +23,7 @@ from d2_plugin.recordings.cameras.camera import CalibratedCamera, pinhole
 from d2_plugin.recordings.cameras.formats.cameras_json import camera_table
 from d2_plugin.recordings.cameras.lens import Lens
 from d2_plugin.recordings.cameras.undistort import UndistortedSource, Undistortion
+from d2_plugin.recordings.files import is_called
 from d2_plugin.recordings.images import IMAGE_SUFFIXES, opencv, read_image
 from d2_plugin.recordings.importing.clocks import METHODS, Clock, common_clock, given_clock, of_one_recorder
 from d2_plugin.recordings.importing.grid import grid_of
@@ -139,7 +140,7 @@ def _positive(text: str) -> float | None:
 def _stills(folder: Path, lenses: Lenses) -> dict[str, tuple[str, np.ndarray]]:
     """Name of a still -> (camera whose lens took it, its undistorted image in that camera's size)."""
     inside = sorted(folder.iterdir()) if folder.is_dir() else []
-    paths = [path for path in inside if path.suffix.lower() in IMAGE_SUFFIXES]
+    paths = [path for path in inside if is_called(path)]
     if not paths:
         raise D2Error(f"--stills {folder} is no folder with images ({', '.join(IMAGE_SUFFIXES)}): give one")
     stills = {}

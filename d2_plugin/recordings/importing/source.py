@@ -63,7 +63,8 @@ class Cut:
                 f"{size[0]}x{size[1]} pixels: give WIDTHxHEIGHT+LEFT+TOP inside of it"
             )
         if min(self.width * self.scale, self.height * self.scale) < 8:
-            raise D2Error(f"--scale {self.scale:g} leaves less than 8 pixels of camera {name}: choose a larger one")
+            why = f"--scale {self.scale:g} of {self.width}x{self.height} pixels"
+            raise D2Error(f"{why} leaves less than 8 of camera {name} along a side: keep more of it")
 
 
 def cuts_of(choices: ImportChoices, sizes: Mapping[str, tuple[int, int]]) -> dict[str, Cut]:

@@ -40,10 +40,7 @@ _log = logging.getLogger(__name__)
 
 MOST_FRAMES = 10_000_000  # A video that has more is damaged: this many are four days at 30 per second
 
-OPENING = {
-    "format_whitelist": "mov,matroska,webm,avi,mpeg,mpegts,mpegvideo",
-    "protocol_whitelist": "file",
-}
+OPENING = {"format_whitelist": "mov,matroska,webm,avi,mpeg,mpegts,mpegvideo", "protocol_whitelist": "file"}
 """Options of FFmpeg, which else follows playlists and scripts to other files and addresses."""
 
 
@@ -58,9 +55,7 @@ class VideoFile:
     unit: Fraction  # seconds
     timecode: str | None = None
     sound: bool = False
-    counted: bool = (
-        False  # frames are found by their order, since what the container says of their times is not ordered
-    )
+    counted: bool = False  # frames are found by their order, since what the container says of their times has none
     keys: tuple[int, ...] = ()  # frames that need no other one, ascending, as the container knows them
     hdr: str = ""  # how its colours are coded where that is no BT.709, such as "PQ, BT.2020"; they are converted
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from d2_plugin.recordings.assembly import assembled
 from d2_plugin.recordings.cameras.formats.easymocap import EXTRINSICS, INTRINSICS, read_rig
-from d2_plugin.recordings.files import cameras_with_images, common_frames, numbered_files
+from d2_plugin.recordings.files import camera_folders, cameras_with_images, common_frames, numbered_files
 from d2_plugin.recordings.images import image_size
 from d2_plugin.recordings.recording import Recording
 
@@ -29,7 +29,7 @@ def open_enerf(path: Path, cameras: tuple[str, ...] | None = None, intersect: bo
     whatever `intersect` says. A camera that is asked for by name must have all three.
     """
     calibrated = {camera.name: camera for camera in read_rig(path)}
-    folders = {folder.name: folder for folder in sorted((path / "images").glob("*")) if folder.is_dir()}
+    folders = camera_folders(path / "images")
     names, notes = cameras_with_images(sorted(calibrated), folders, cameras, True, path / EXTRINSICS)
     images = {name: numbered_files(folders[name]) for name in names}
     frames, frame_notes = common_frames(images, path / "images")

@@ -21,7 +21,7 @@ from d2_plugin.reading import field, read_json
 from d2_plugin.recordings.assembly import CORRECT, assembled
 from d2_plugin.recordings.cameras.camera import CalibratedCamera, checked_rate
 from d2_plugin.recordings.cameras.formats.cameras_json import read_camera
-from d2_plugin.recordings.files import cameras_with_images, common_frames, frame_number, numbered_files
+from d2_plugin.recordings.files import camera_folders, cameras_with_images, common_frames, frame_number, numbered_files
 from d2_plugin.recordings.images import image_size
 from d2_plugin.recordings.recording import Exposure, Recording
 from d2_plugin.values import Range
@@ -49,7 +49,7 @@ def open_folder(path: Path, cameras: tuple[str, ...] | None = None, intersect: b
     where = str(path / CALIBRATION)
     description = read_json(path / CALIBRATION, CORRECT)
     calibrated = _calibrated(description, where)
-    pictured = {folder.name: folder for folder in sorted((path / "images").iterdir()) if folder.is_dir()}
+    pictured = camera_folders(path / "images")
     names, notes = cameras_with_images(calibrated, pictured, cameras, intersect, path / CALIBRATION)
     images = {name: numbered_files(pictured[name]) for name in names}
     frames, frame_notes = common_frames(images, path / "images")

@@ -7,7 +7,6 @@ near and far depth. The principal point is the centre of the image.
 
 from __future__ import annotations
 
-import logging
 import re
 from pathlib import Path
 
@@ -29,8 +28,6 @@ from d2_plugin.recordings.files import (
 from d2_plugin.recordings.images import IMAGE_SUFFIXES, image_size
 from d2_plugin.recordings.importing.video import VideoFrames, read_video, usual_rate
 from d2_plugin.recordings.recording import Recording
-
-log = logging.getLogger(__name__)
 
 POSES = "poses_bounds.npy"
 
@@ -131,10 +128,7 @@ def _rows(path: Path) -> np.ndarray:
 
 def _known_flaws(path: Path, names: list[str]) -> tuple[str, ...]:
     flawed = [name for name in names if name in UNSYNCHRONISED.get(path.resolve().name, ())]
-    notes = tuple(f"{name} is known to be unsynchronised: consider leaving it out" for name in flawed)
-    for note in notes:
-        log.warning("%s", note)
-    return notes
+    return tuple(f"{name} is known to be unsynchronised: consider leaving it out" for name in flawed)
 
 
 def _extracted(path: Path) -> dict[str, FrameFiles]:
@@ -151,5 +145,5 @@ def _extracted(path: Path) -> dict[str, FrameFiles]:
             return files
         if not partly and any(files.values()):
             partly = files
-    loose = {file.name: file for file in (path / "images").glob("*_*") if file.suffix.lower() in IMAGE_SUFFIXES}
+    loose = {file.name: file for file in (path / "images").glob("[!.]*_*") if file.suffix.lower() in IMAGE_SUFFIXES}
     return partly or by_camera({name: shot for name in sorted(loose) if (shot := by_prefix(name))}, loose)

@@ -44,7 +44,7 @@ NEAR_FAR = {
 }
 """Depth bounds by scene, metres, as HyperReel chose them."""
 
-_NAME = re.compile(r"(?P<scene>[^_]*)_.*?(?P<frame>\d+)_(?P<camera>\d+)$")
+_NAME = re.compile(r"(?P<scene>(?!\.)[^_]*)_.*?(?P<frame>\d+)_(?P<camera>\d+)$")
 
 
 def is_technicolor(path: Path) -> bool:

@@ -77,7 +77,8 @@ def write_video(path: Path, form: Format, fps: float, quality: int = 18) -> Iter
 class _Encoder:
     def __init__(self, av: Any, path: Path, form: str, rate: Fraction, quality: int) -> None:
         self.av, self.form, self.rate, self.quality, self.count = av, form, rate, quality, 0
-        self.container: Any = av.open(str(path), "w", format=form, options=CODECS[form][1])
+        exact = {"movie_timescale": str(rate.numerator)} if form == "mp4" else {}  # else a length in whole milliseconds
+        self.container: Any = av.open(str(path), "w", format=form, options=CODECS[form][1] | exact)
         self.stream: Any = None
 
     def add(self, image: np.ndarray) -> None:

@@ -148,7 +148,10 @@ CASES: list[tuple[Callable[[Filmed], object], list[str], str]] = [
     (lambda given: None, ["--offsets", "timecode"], r"nothing in the timecode links"),
     (lambda given: None, ["--crop", "9000x10+0+0"], r"lies outside of camera 02, which has"),
     (lambda given: None, ["--crop", "all of it"], r"--crop says 'all of it', expected WIDTHxHEIGHT\+LEFT\+TOP"),
-    (lambda given: None, ["--scale", "0.001"], r"--scale 0.001 leaves less than 8 pixels"),
+    (lambda given: None, ["--scale", "0.001"], r"--scale 0.001 of \d+x\d+ pixels leaves less than 8 of camera 02"),
+    (lambda given: None, ["--crop", "4x9+0+0"], r"--scale 1 of 4x9 pixels leaves less than 8 .*: keep more of it"),
+    (lambda given: None, ["--offsets", "3"], r"--offsets says '3', expected auto, .* or NAME=FRAMES such as 02="),
+    (lambda given: (given.videos / "02.mp4").rename(given.videos / "z.mp4"), [], r"matched in the order .*; camera"),
 ]
 
 

@@ -9,13 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from d2_plugin.recordings.cameras.calibrating.features import (
-    Features,
-    Matches,
-    as_colmap,
-    pixel_error,
-    silent_pycolmap,
-)
+from d2_plugin.recordings.cameras.calibrating.features import Features, Matches, as_colmap, pixel_error, silent_pycolmap
 from d2_plugin.recordings.cameras.camera import pinhole, rigid
 from d2_plugin.recordings.recording import Camera
 

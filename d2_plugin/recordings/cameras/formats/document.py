@@ -123,6 +123,8 @@ def numbers(table: Mapping[str, Any], key: str, shape: tuple[int, ...], place: s
         )
     if not (np.abs(array) <= LARGEST_NUMBER).all():
         raise D2Error(f"{key} of {place} has a number that is not finite or too large: {CORRECT}")
+    if shape == (4, 4) and not np.allclose(last := array.ravel()[12:], [0, 0, 0, 1]):
+        raise D2Error(f"{key} of {place} ends with the row {last.tolist()}, expected 0 0 0 1: {CORRECT}")
     return array.reshape(shape)
 
 

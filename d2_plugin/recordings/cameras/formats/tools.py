@@ -135,10 +135,7 @@ def read_kalibr(document: Document) -> Cameras:
         if name != f"cam{number}":
             raise D2Error(f"{place} is out of the chain, expected cam{number} there: {CORRECT}")
         if number:
-            link = numbers(table, "T_cn_cnm1", (4, 4), place)
-            if not np.allclose(link[3], [0, 0, 0, 1]):
-                raise D2Error(f"T_cn_cnm1 of {place} ends with the row {link[3].tolist()}, expected 0 0 0 1: {CORRECT}")
-            pose = link @ pose
+            pose = numbers(table, "T_cn_cnm1", (4, 4), place) @ pose
         cameras.append(_kalibr_camera(table, name, pose, place))
     return cameras
 

@@ -49,13 +49,11 @@ def _listed(frame: Any, common: Table, place: str) -> ListedImage:
     table = object_of(frame, place)
     label = str(table["camera_label"]) if "camera_label" in table else ...
     name = field(table, "file_path", str, place, CORRECT, default=label).removeprefix("./")
-    values = numbers(table, "transform_matrix", (-1,), f"{name}, {place},")
-    if values.size not in (12, 16):
-        raise D2Error(
-            f"{name}, {place}, cannot be understood: its matrix has {values.size} numbers, expected 4 x 4: {CORRECT}"
-        )
+    values = numbers(table, "transform_matrix", (-1,), f"{name}, {place},").tolist()
+    whole = {"transform_matrix": [*values, 0, 0, 0, 1] if len(values) == 12 else values}
+    matrix = numbers(whole, "transform_matrix", (4, 4), f"{name}, {place},")
     time = round(field(table, "time", NUMBER, place, CORRECT), TIME_DIGITS) if "time" in table else None
-    return ListedImage(name, np.vstack([values[:12].reshape(3, 4), [0, 0, 0, 1]]), time, {**common, **table})
+    return ListedImage(name, matrix, time, {**common, **table})
 
 
 def still(images: list[ListedImage]) -> bool:
