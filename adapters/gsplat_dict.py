@@ -24,17 +24,7 @@ from d2_plugin.gaussians.spherical_harmonics import coefficients_from_rgb
 from d2_plugin.protocol import Points, RasterSettings, Splats, View
 
 from .keys import ViewsByPose
-from .shared import (
-    Renders,
-    Resizing,
-    appended,
-    finite,
-    on_device,
-    replaced,
-    seen_colors,
-    splats_of,
-    with_rows,
-)
+from .shared import Renders, Resizing, appended, finite, on_device, replaced, seen_colors, splats_of, with_rows
 
 ROWS = "d2_rows"
 """The column in the strategy's state: the number of each row plus one, since gsplat marks what is new with zeros."""
@@ -244,10 +234,5 @@ def gsplat_view(camera: str, frame: int, time: float, camtoworld: Tensor, K: Ten
 
 def _first_occurrences(rows: Tensor) -> Tensor:
     """`rows` [N] with -1 for every repetition of a number: a clone starts anew, its original goes on."""
-    order = torch.argsort(rows, stable=True)
-    ordered = rows[order]
-    repeated = torch.zeros_like(ordered, dtype=torch.bool)
-    repeated[1:] = ordered[1:] == ordered[:-1]
-    index = rows.clone()
-    index[order[repeated]] = -1
-    return index
+    ordered, order = torch.sort(rows, stable=True)
+    return rows.index_fill(0, order[1:][ordered[1:] == ordered[:-1]], -1)

@@ -13,6 +13,9 @@ from d2_plugin.protocol import Points
 DISTANCES_AT_ONCE = 1 << 24
 """Entries of the distance matrix that are held at a time (64 MiB in float32)."""
 
+FAR = 1e18
+"""Where Gaussians without a finite place are taken to be: its square is still a float."""
+
 ACCEPTED = 0.5
 """Largest accepted residual, in standard deviations of each point: one that is off by half of its own width still
 covers its pixel, whatever the unit of length."""
@@ -73,7 +76,7 @@ def neighbour_offsets(targets: Tensor, means: Tensor, offsets: Tensor) -> Tensor
     if not len(means) or not len(targets):
         return torch.zeros_like(targets)
     centre = targets.mean(0)  # the distances are differences of large squares far from the origin
-    centred = means - centre
+    centred = torch.nan_to_num(means, FAR, FAR, -FAR) - centre  # argmin takes a NaN for the nearest
     rows = max(1, DISTANCES_AT_ONCE // len(means))
     nearest = torch.cat([torch.cdist(part, centred).argmin(1) for part in (targets - centre).split(rows)])
     return offsets[nearest]

@@ -107,13 +107,13 @@ class KeysByPose:
     def __init__(self, cameras: Mapping[str, Tensor], frame: Callable[[Any], int], tolerance: float = 1e-3) -> None:
         self.names, self.poses = list(cameras), torch.stack([torch.as_tensor(pose) for pose in cameras.values()])
         self.frame, self.tolerance = frame, tolerance
-        self._key = once_per_camera("world_view_transform", self._nearest)
+        self._name = once_per_camera("world_view_transform", self._nearest)
 
     def __call__(self, camera: Any) -> PriorKey:
-        """The key of a camera object of the Inria family."""
-        return self._key(camera)
+        """The key of a camera object of the Inria family, at its present frame."""
+        return PriorKey(self._name(camera), self.frame(camera))
 
-    def _nearest(self, camera: Any) -> PriorKey:
+    def _nearest(self, camera: Any) -> str:
         pose = camera.world_view_transform.detach().T
         distances = _distances(self.poses, pose)
         nearest = int(distances.argmin())
@@ -122,7 +122,7 @@ class KeysByPose:
                 f"camera '{getattr(camera, 'image_name', camera)}' stands at none of the known poses (the nearest, "
                 f"{self.names[nearest]}, differs by {float(distances[nearest]):.3g}): give poses in the trainer's world"
             )
-        return PriorKey(self.names[nearest], self.frame(camera))
+        return self.names[nearest]
 
 
 def _distances(poses: Tensor, pose: Tensor) -> Tensor:

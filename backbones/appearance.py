@@ -30,10 +30,9 @@ class Appearance:
 
     def start_from(self, gains: Mapping[str, Sequence[float]], training: Sequence[str]) -> None:
         """Begin with measured gains, by camera and channel, before the first step; only their ratios count."""
-        logs = {name: torch.tensor(gain, dtype=torch.float64, device=self.device).log() for name, gain in gains.items()}
-        if not set(training) <= logs.keys():
+        if not set(training) <= gains.keys():
             return
-        ratios = {name: log.exp() for name, log in logs.items()}
+        ratios = {name: torch.tensor(gain, dtype=torch.float64, device=self.device) for name, gain in gains.items()}
         mean = torch.stack([ratios[name] for name in training]).mean(0)
         for name, ratio in ratios.items():
             change = torch.cat([torch.diag(ratio / mean - 1), ratio.new_zeros(3, 1)], 1).float()

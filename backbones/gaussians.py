@@ -66,7 +66,7 @@ class Gaussians:
         """Continue from `state_dict()`, whatever the present number of Gaussians."""
         for name, value in state["parameters"].items():
             self._replace(name, lambda old, new=value: new.to(old), keep_moments=False)
-        self.statistics = {name: value.clone() for name, value in state["statistics"].items()}
+        self.statistics = {name: value.to(self.device, copy=True) for name, value in state["statistics"].items()}
         self.optimizer.load_state_dict(state["optimizer"])
 
     @torch.no_grad()

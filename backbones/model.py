@@ -268,7 +268,7 @@ class SplatModel(ABC):
             observer.optimized()
 
     def densify(self, step: int, iterations: int, generator: torch.Generator) -> None:
-        """The backbone's own clone, split, prune and opacity reset where `settings.densify` schedules them."""
+        """The backbone's own clone, split and prune where `settings.densify` schedules them."""
         densify(self, self.settings.densify, step, iterations, generator)
 
     def append(self, rows: Mapping[str, Tensor]) -> None:

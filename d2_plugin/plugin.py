@@ -7,13 +7,14 @@ d2.step(step)                                     # after optimizer.step() and z
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import logging
 import os
 import threading
 import warnings
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar, cast
 
@@ -53,15 +54,24 @@ if hasattr(os, "register_at_fork"):
 Method = TypeVar("Method", bound=Callable[..., Any])
 
 
+@contextlib.contextmanager
+def _in_full() -> Iterator[None]:
+    """Outside of the trainer's autocast: 16 bits place points pixels away from where they are."""
+    on_gpu = torch.autocast("cuda", enabled=False) if torch.is_autocast_enabled() else contextlib.nullcontext()
+    with torch.autocast("cpu", enabled=False), on_gpu:
+        yield
+
+
 def _by_one_thread(method: Method) -> Method:
-    """Refuse a call while another thread is within one."""
+    """Refuse a call while another thread is within one; compute in full precision."""
 
     @functools.wraps(method)
     def alone(self: D2Hooks, *given: Any, **named: Any) -> Any:
         if not self._used.acquire(blocking=False):
             raise D2Error("two threads use one D2Hooks at once: call d2.loss and d2.step from the thread that trains")
         try:
-            return method(self, *given, **named)
+            with _in_full():
+                return method(self, *given, **named)
         finally:
             self._used.release()
 
@@ -99,8 +109,8 @@ class D2Hooks:
         self._count = len(backbone)
         self._warned = self._idle_insert = False
         self._inserting = 0  # the step while the backbone inserts for us, else 0
-        self._fresh = torch.zeros(0, dtype=torch.int32)  # 1 for what the trainer added since our last step
-        self.inserted_at = torch.zeros(self._count, dtype=torch.int32)
+        self._fresh = torch.zeros(0, dtype=torch.int32, device="cpu")  # 1: the trainer added it since our last step
+        self.inserted_at = torch.zeros(self._count, dtype=torch.int32, device="cpu")
         """Per Gaussian [N], the step at which D2 inserted it; 0 for the backbone's own."""
         self._idle = Idle(self.hooks, config.retire_after)
         self.log = RunLog(self.hooks)
@@ -263,7 +273,7 @@ class D2Hooks:
             self.generator.set_state(state["generator"].cpu())
             self._idle.load(state)
         self._order = StepOrder()
-        self._count = len(self.backbone)
+        self._count, self._fresh = len(self.backbone), self._fresh[:0]
         self._finite.step = self._finite.saved = state.get("step", 0)
         self.inserted_at = state.get("inserted_at", torch.zeros(self._count, dtype=torch.int32)).cpu()
 
@@ -365,8 +375,8 @@ class D2Hooks:
                 stacklevel=3,
             )
             self._warned = True
-        self._count = len(self.backbone)
-        self.inserted_at = torch.zeros(self._count, dtype=torch.int32)
+        self._count, self._fresh = len(self.backbone), self._fresh[:0]
+        self.inserted_at = torch.zeros(self._count, dtype=torch.int32, device="cpu")
 
 
 def _open_store(config: D2Config, hooks: Mapping[str, Hook]) -> Store:

@@ -247,7 +247,7 @@ class Backbone(Protocol):
         RAdam does: schedules count these. It rises by one a step at most.
     ``colors(view, splats) -> Tensor``
         RGB [M, 3] of what `slice_at(view)` returned, as the view's camera saw them where exposures are learnt,
-        differentiable: the live viewer shows them, and grey without; the hook `motion` supervises them.
+        differentiable: the live viewer shows them, and grey without; `motion` and `parallax` supervise them.
     ``trained() -> Mapping[str, Tensor]``
         the tensors that are trained, by name: training stops where one is not finite, and names it.
     ``behind(render, view) -> Render``

@@ -71,9 +71,7 @@ class TestBuilding:
         left = [path.suffix for path in sorted(folder.iterdir())]
         assert left == [".lock", ".sha256", ".so"], "nothing temporary is left"
 
-    def test_a_changed_header_or_flag_compiles_anew_and_the_users_own_come_last(
-        self, source, builds, monkeypatch
-    ) -> None:
+    def test_a_changed_header_or_flag_compiles_anew_and_the_users_come_last(self, source, builds, monkeypatch) -> None:
         load(source)
         source.with_name("number.h").write_text("#define NUMBER 43\n")
         assert load(source).answer() == 43
@@ -104,9 +102,7 @@ class TestBuilding:
         with pytest.raises(CompileError, match=r"compiling answer\.cpp failed(.|\n)*no_such_name"):
             load(source)
 
-    def test_no_compiler_is_an_error_of_its_own_and_so_is_one_from_before_2017(
-        self, source, monkeypatch, tmp_path
-    ) -> None:
+    def test_no_compiler_is_an_error_of_its_own_as_is_one_from_before_2017(self, source, monkeypatch, tmp_path) -> None:
         monkeypatch.setenv("CXX", "no-such-compiler")
         refuses("CXX names 'no-such-compiler'", load, source, error=NoCompiler)
         old = script(tmp_path / "old", "echo \"unrecognized command line option '-std=c++17'\" >&2\nexit 1")

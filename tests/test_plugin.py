@@ -5,7 +5,9 @@ import logging
 import math
 import random
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -20,6 +22,7 @@ from d2_plugin.backbones.trainer import Trainer, TrainSettings
 from d2_plugin.config import D2Config, DensifyConfig, PruneConfig
 from d2_plugin.hooks.finite import Diverged, FiniteCheck
 from d2_plugin.hooks.hook import Context, Hook, HookConfig
+from d2_plugin.hooks.prune import Prune
 from d2_plugin.hooks.views import ViewSampler
 from d2_plugin.protocol import Points, Splats, View
 from d2_plugin.rasterizer import rasterize
@@ -97,6 +100,47 @@ def test_a_backbone_that_changes_silently_is_noticed_once() -> None:
     assert d2.hooks["prune"].streak is None
     model.gaussians.select(torch.arange(40))
     d2.step(2)
+
+
+def test_a_change_that_is_told_and_one_that_is_not_spoil_no_count_of_what_the_trainer_added() -> None:
+    model = make_model()
+    d2 = D2Hooks(replace(ALL_HOOKS, densify=DensifyConfig(max_gaussians=30)), Yang4DAdapter(model), TinyStore())
+    model.select(torch.arange(60).repeat(2))
+    model.gaussians.select(torch.arange(110))
+    with pytest.warns(UserWarning, match="without telling"):
+        d2.step(1)
+
+
+def test_neither_autocast_nor_another_default_device_changes_a_loss_or_an_edit(monkeypatch) -> None:
+    monkeypatch.setattr(
+        "d2_plugin.plugin.check_surroundings", lambda: None
+    )  # it refuses `meta`, which stands for a GPU
+    prior = TinyStore().prior("cam0", 0)
+
+    def after(context: AbstractContextManager[object]) -> list[torch.Tensor]:
+        model, views = make_model(), make_views()
+        d2 = D2Hooks(ALL_HOOKS, make_adapter(model), SimpleNamespace(prior=lambda *key: prior))
+        with context:
+            for step, view in enumerate(views, 1):
+                loss = d2.loss(step, view)
+                d2.step(step)
+        return [loss, model.gaussians["positions"], d2.inserted_at]
+
+    expected = after(nullcontext())
+    assert expected[-1].any(), "nothing was inserted"
+    for context in (torch.autocast("cpu", torch.bfloat16), torch.device("meta")):
+        torch.testing.assert_close(after(context), expected, rtol=0, atol=0)
+
+
+def test_a_state_that_was_loaded_on_another_device_goes_on() -> None:
+    sampler, prune = ViewSampler(), Prune(PruneConfig())
+    for view in make_views():
+        sampler.add(view)
+    prune.load_state_dict({"streak": torch.ones(3, dtype=torch.int64)})
+    sampler.add(replace(view, K=view.K.to("meta"), T_camera_world=view.T_camera_world.to("meta")))
+    prune.follow(torch.arange(3, device="meta"))
+    found = [prune.streak, *(view.K for view in sampler.sample(99, torch.Generator()))]
+    assert {tensor.device.type for tensor in found} == {"meta"}
 
 
 def test_evaluations_visit_every_view_before_any_twice() -> None:

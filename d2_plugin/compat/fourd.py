@@ -20,12 +20,10 @@ from d2_plugin.compat.inria import (
 )
 from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.rotation4d import covariances_from_factors, rotation_matrices_4d, time_row
+from d2_plugin.gaussians.slicing import MARGINAL_CUT
 from d2_plugin.protocol import Splats
 
 __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer"]
-
-MARGINAL_MIN = 0.05
-"""Gaussians whose temporal factor is not above this are skipped (forward.cu, computeCov3D_conditional)."""
 
 
 class GaussianRasterizer(inria.GaussianRasterizer):
@@ -131,5 +129,5 @@ def _alive(offset: Tensor, variance: Tensor, prefilter: float) -> tuple[Tensor, 
     """Rows [M] that live at the time `offset` [N] away, and their temporal factor F [M]."""
     widened = variance + prefilter if prefilter > 0 else variance
     marginal = torch.exp(-0.5 * offset.square() / widened)
-    rows = (marginal.detach() > MARGINAL_MIN).nonzero()[:, 0]
+    rows = (marginal.detach() > MARGINAL_CUT).nonzero()[:, 0]
     return rows, marginal[rows]

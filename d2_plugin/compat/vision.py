@@ -38,9 +38,8 @@ def save_image(tensor: Tensor, fp: str | Path, **options: Any) -> None:
     """One image in 0..1, or a grid of several, as a file."""
     from PIL import Image
 
-    image = make_grid(tensor, **options) if tensor.ndim == 4 and len(tensor) > 1 else tensor.reshape(
-        -1, *tensor.shape[-2:]
-    )  # fmt: skip
+    several = tensor.ndim == 4 and len(tensor) > 1
+    image = make_grid(tensor, **options) if several else tensor.reshape(-1, *tensor.shape[-2:])
     values = (image.detach().cpu().clamp(0, 1) * 255 + 0.5).byte().permute(1, 2, 0).numpy()
     Image.fromarray(values[..., 0] if values.shape[-1] == 1 else np.ascontiguousarray(values)).save(fp)
 

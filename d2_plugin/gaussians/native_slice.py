@@ -125,8 +125,8 @@ def _rows(call: Any) -> Tensor:
     """The Gaussians that are drawn, int64 [M]; sets `call.drawn` to M."""
     if not call.times:
         call.drawn = call.count
-        return torch.arange(call.count)
-    rows = torch.empty(call.count, dtype=torch.int64)
+        return torch.arange(call.count, device="cpu")
+    rows = torch.empty(call.count, dtype=torch.int64, device="cpu")
     call.point(rows=rows)
     call.drawn = library().d2_slice_rows(call)
     return rows[: call.drawn]

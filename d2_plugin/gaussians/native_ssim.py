@@ -56,7 +56,7 @@ class _Photometric(torch.autograd.Function):
         height, width, channels = image.shape
         image, target = image.contiguous(), target.contiguous()
         gradient = torch.empty_like(image) if ctx.needs_input_grad[0] else None
-        sums = torch.empty(2, height, dtype=torch.float64)
+        sums = image.new_empty(2, height, dtype=torch.float64)
         call = _Call(height, width, channels, torch.get_num_threads(), ssim_weight, (ctypes.c_float * 11)(*window))
         call.point(image=image, gradient=gradient, differences=sums[0], similarities=sums[1])
         call.point(**{"bytes" if target.dtype == torch.uint8 else "target": target})

@@ -41,14 +41,8 @@ def reference_slice(
         rows = torch.arange(len(raw["positions"]), device=factors.device)
         return raw["positions"], covariances_from_factors(factors), torch.sigmoid(raw["opacity_logits"]), rows
     log_scales = torch.cat([raw["log_scales"], raw["log_time_scales"][:, None]], 1)
-    parts: tuple[Tensor, ...] = (
-        raw["positions"],
-        log_scales,
-        raw["left"],
-        raw["right"],
-        raw["opacity_logits"],
-        raw["times"],
-    )
+    others = [raw[name] for name in ("left", "right", "opacity_logits", "times")]
+    parts: tuple[Tensor, ...] = (raw["positions"], log_scales, *others)
     # A Gaussian outside its temporal support is never projected; without a gradient, none of it is 0 * inf.
     with torch.no_grad():
         axes = unit_quaternions(raw["left"]), unit_quaternions(raw["right"])
@@ -58,9 +52,7 @@ def reference_slice(
     if len(rows) < len(log_scales):
         parts = tuple(part.index_select(0, rows) for part in parts)
     positions, log_scales, left, right, logits, times = parts
-    if (
-        alive.is_cuda
-    ):  # all rows are here; those outside their support get an opacity of 0, and numbers that harm nobody
+    if alive.is_cuda:  # all rows are here: those outside their support get an opacity of 0 and harmless numbers
         log_scales, times = torch.where(alive[:, None], log_scales, 0.0), torch.where(alive, times, time)
         logits = torch.where(alive, logits, -torch.inf)
     rotation = rotation_matrices_4d(unit_quaternions(left), unit_quaternions(right))

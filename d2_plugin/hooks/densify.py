@@ -118,7 +118,7 @@ def back_project(view: View, pixels: Tensor, depth: Tensor) -> Tensor:
 def shuffled_pixels(mask: Tensor, generator: torch.Generator) -> Tensor:
     """All pixels [K, 2] (column, row) of `mask` [H, W], in random order."""
     rows, columns = torch.nonzero(mask, as_tuple=True)
-    order = torch.randperm(len(rows), generator=generator).to(rows.device, non_blocking=True)
+    order = torch.randperm(len(rows), generator=generator, device="cpu").to(rows.device, non_blocking=True)
     return torch.stack([columns, rows], -1)[order]
 
 

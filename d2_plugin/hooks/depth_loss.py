@@ -68,7 +68,7 @@ def depth_loss(
     residual = torch.where(mask, depth - target, torch.zeros_like(depth)) / (target + EPSILON)
     if far is not None:
         residual = torch.where(far, residual.clamp(max=0), residual)
-    counted = torch.where(mask, weight, 0).to(depth)
+    counted = torch.where(mask, weight, 0).to(residual)
     return (counted * charbonnier(residual, epsilon)).sum() / (counted.sum() + EPSILON)
 
 

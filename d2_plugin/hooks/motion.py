@@ -73,7 +73,7 @@ class Motion(ImageHook):
         if pair is not None and (maps := pair[1].maps.codes).colors is not None:
             yield pair[0], maps.colors, maps.labels != Label.CONFLICT
         for _ in range(min(int(self.config.again * len(seen)), MOST_AGAIN)):
-            other = seen[int(torch.randint(len(seen), (1,), generator=context.generator))]
+            other = seen[int(torch.randint(len(seen), (1,), generator=context.generator, device="cpu"))]
             moving = context.prior.moving(other, seen)
             if moving is not None:
                 yield *moving, None

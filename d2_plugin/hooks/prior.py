@@ -142,7 +142,8 @@ class CameraCheck:
             self._check_pose(view, first, _relative(pose, first_pose), _relative(built, first_built), slack)
 
     def _check_intrinsics(self, view: View, built: Tensor) -> None:
-        K, size = view.K.detach().double().cpu(), torch.tensor([view.width, view.height], dtype=torch.float64)
+        K = view.K.detach().double().cpu()
+        size = K.new_tensor([view.width, view.height])
         focal = K.diagonal()[:2], built.diagonal()[:2]
         centre = K[:2, 2], built[:2, 2]
         if ((focal[0] / focal[1] - 1).abs() > FOCAL_TOLERANCE).any():
@@ -292,6 +293,7 @@ class PriorLoader:
         self._kept.move_to_end(key)
         kept = self._kept[key]
         if kept is None:
+            self.images.pop(key, None)
             if view.camera not in self._without:
                 self._without.add(view.camera)
                 have = ", ".join(map(str, getattr(self.store, "cameras", ()))) or "unknown"

@@ -192,8 +192,8 @@ class Prune(Hook):
             high = floating(sums) | faint(sums)
         if self.streak is None:
             self.streak = torch.zeros(count, dtype=torch.int64, device=high.device)
-        updated = torch.where(high, self.streak + 1, torch.zeros_like(self.streak))
-        self.streak = torch.where(sums.weight > 0, updated, self.streak)
+        streak = self.streak.to(high.device)  # its state may have been loaded elsewhere
+        self.streak = torch.where(sums.weight > 0, torch.where(high, streak + 1, 0), streak)
         remove = within_light(self.streak >= config.patience, sums.weight, config.light)
         if config.sight:
             last = config.stop is not None and context.step + config.every >= config.stop
@@ -203,7 +203,8 @@ class Prune(Hook):
     def follow(self, index: Tensor) -> None:
         """Streaks move with their Gaussians; new ones start at 0."""
         if self.streak is not None:
-            before = self.streak[index.clamp(min=0)] if len(self.streak) else self.streak.new_zeros(len(index))
+            streak = self.streak.to(index.device)
+            before = streak[index.clamp(min=0)] if len(streak) else streak.new_zeros(len(index))
             self.streak = torch.where(index >= 0, before, 0)
 
     def reset(self) -> None:

@@ -26,6 +26,9 @@ PAUSE = 30.0
 MEANS_OVER = 10
 """Steps over which a loss is averaged for TensorBoard: reading it stops the GPU."""
 
+LAST = 100
+"""Terms that a mean looks back over, with weights that fall: where nothing is inserted none is read before the end."""
+
 
 @dataclass(frozen=True)
 class Trace:
@@ -187,17 +190,18 @@ class RunLog:
 
 
 class _Mean:
-    """The mean of a term since it was last read; tensors are added where they are, so that nothing waits for a GPU."""
+    """Mean of a term since it was last read, or of its last hundred; summed where it is: nothing waits for a GPU."""
 
     def __init__(self) -> None:
-        self._sum: Tensor | None = None
+        self._mean: Tensor | None = None
         self._count = 0
         self._first: Tensor | None = None
         self._last = float("nan")
 
     def add(self, term: Tensor) -> None:
         self._first = term if self._first is None else self._first
-        self._sum, self._count = term if self._sum is None else self._sum + term, self._count + 1
+        self._count += 1
+        self._mean = term if self._mean is None else self._mean + (term - self._mean) / min(self._count, LAST)
 
     @property
     def first(self) -> float:
@@ -205,8 +209,8 @@ class _Mean:
 
     def now(self) -> float:
         """The mean; what it was at the last reading if nothing came since."""
-        if self._sum is not None:
-            self._last, self._sum, self._count = float(self._sum) / self._count, None, 0
+        if self._mean is not None:
+            self._last, self._mean, self._count = float(self._mean), None, 0
         return self._last
 
 

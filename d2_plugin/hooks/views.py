@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -29,7 +30,10 @@ class ViewSampler:
 
     def add(self, view: View) -> bool:
         """Remember a view; whether it was not known before."""
-        new = (view.camera, view.frame) not in self._views
+        new, device = (view.camera, view.frame) not in self._views, view.K.device
+        if self._views and next(iter(self._views.values())).K.device != device:  # their state was loaded elsewhere
+            for key, old in self._views.items():
+                self._views[key] = replace(old, K=old.K.to(device), T_camera_world=old.T_camera_world.to(device))
         if new:
             check_view(view)
             poses = [known.T_camera_world for known in self.instants(view.camera)[:1]]
@@ -63,7 +67,7 @@ class ViewSampler:
             self._next_camera += 1
             fewest = min(looks for (name, _), looks in self._looks.items() if name == camera)
             keys = [key for key, looks in self._looks.items() if key[0] == camera and looks == fewest]
-            key = keys[int(torch.randint(len(keys), (1,), generator=generator))]
+            key = keys[int(torch.randint(len(keys), (1,), generator=generator, device="cpu"))]
             self._looks[key] += 1
             chosen[key] = self._views[key]
         return list(chosen.values())

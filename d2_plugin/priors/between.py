@@ -76,7 +76,7 @@ def build_between(store: PriorStore, progress: Callable[[int], None] | None = No
     flights = [flight for camera in cameras for interval in camera.flights for flight in interval if flight is not None]
     acceleration = common_acceleration(flights) if even else None
     done = 0
-    with store.building(store.path):
+    with store.building():
         while cameras:
             camera = cameras.pop(0)
             for index, (first, second) in enumerate(pairs):

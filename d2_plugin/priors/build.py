@@ -81,7 +81,7 @@ def build_priors(
     store = PriorStore.create(output, names, recording.frames, describe_recording(recording))
     summary = PriorSummary(notes=sources.notes, folder=store.path)
     total, done = len(frames) * len(names), 0
-    with store.building(output):
+    with store.building():
         for number in frames:
             for name, built in _build_frame(sources, store, number):
                 record = store.record(name, number) or {}

@@ -28,7 +28,7 @@ from d2_plugin.protocol import Label
 from d2_plugin.recordings.recording import Camera, MonoKind
 from d2_plugin.store.maps import FusedPrior, empty_prior
 
-CONSTRUCTION_VERSION = 16  # raise it when alignment or fusion change what they return
+CONSTRUCTION_VERSION = 17  # raise it when alignment or fusion change what they return
 
 FARTHEST = 3.0
 """Aligned monocular depth beyond this multiple of the 99.5 percentile of the anchors is left empty."""
@@ -274,6 +274,9 @@ def _aligned(prepared: _Prepared, settings: PriorSettings) -> _AlignedMap:
     if settings.uncertainty and (anchors.size > 0 or alignment.status is AlignStatus.ACROSS):
         kind = prepared.kind if prepared.shifted else None
         uncertainty = monocular_uncertainty(aligned, geometric, settings.align, prepared.confidence, kind)
+        # A map that says nothing of a pixel contradicts nothing there.
+        unsaid = np.where(np.isnan(prediction), np.float32(np.inf), uncertainty.at_anchors)
+        uncertainty = uncertainty._replace(at_anchors=unsaid)
         if alignment.status is AlignStatus.ACROSS or np.isnan(uncertainty.skill.scale):
             shared = np.where(depth > 0, np.float32(alignment.across), np.float32(np.inf))
             if not prepared.shifted:

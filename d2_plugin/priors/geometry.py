@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -66,21 +66,15 @@ def relative_pose(reference: Camera, source: Camera) -> np.ndarray:
 
 def view_pair(reference: Camera, source: Camera) -> ViewPair:
     """The homography parts A and k from `reference` to `source`; read-only arrays."""
-    return _view_pair(_Known(reference), _Known(source))
+    return _view_pair(*(_Known(c.K.tobytes() + c.T_camera_world.tobytes(), c) for c in (reference, source)))
 
 
+@dataclass(frozen=True)
 class _Known:
     """A camera as a key: equal where intrinsics and pose are, as they are now."""
 
-    def __init__(self, camera: Camera) -> None:
-        self.camera = camera
-        self.numbers = np.asarray(camera.K).tobytes() + np.asarray(camera.T_camera_world).tobytes()
-
-    def __hash__(self) -> int:
-        return hash(self.numbers)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Known) and self.numbers == other.numbers
+    numbers: bytes
+    camera: Camera = field(compare=False)
 
 
 @functools.lru_cache(maxsize=1024)

@@ -61,10 +61,15 @@ def foreground(image: np.ndarray, still: np.ndarray) -> np.ndarray:
 
 def dense_flow(image: np.ndarray, other: np.ndarray) -> np.ndarray:
     """Optical flow [H, W, 2] (columns, rows) in pixels from one RGB image to another."""
-    cv2 = opencv("scene flow")
+    cv2, (height, width) = opencv("scene flow"), image.shape[:2]
     method = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    method.setFinestScale(round(math.log2(max(image.shape[1] / FINE_WIDTH, 1))))
-    return np.asarray(method.calc(*(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY) for rgb in (image, other)), None))
+    method.setFinestScale(round(math.log2(max(width / FINE_WIDTH, 1))))
+    grays = [cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY) for rgb in (image, other)]
+    # OpenCV refuses images of fewer than 12 pixels, and halves a wide one until it has no row left: the rim repeats.
+    rim = 0, max(12, width // 16, height) - height, 0, max(12 - width, 0)
+    if any(rim):
+        grays = [cv2.copyMakeBorder(gray, *rim, cv2.BORDER_REPLICATE) for gray in grays]
+    return np.asarray(method.calc(*grays, None)[:height, :width])
 
 
 def followed(image: np.ndarray, other: np.ndarray, flow: np.ndarray, back: np.ndarray) -> np.ndarray:
@@ -149,7 +154,7 @@ def _components(mask: np.ndarray, least: int) -> Iterator[np.ndarray]:
 
 def _small(*maps: np.ndarray) -> list[np.ndarray]:
     cv2, factor = opencv("scene flow"), max(1, round(maps[0].shape[1] / FINE_WIDTH))
-    size = [length // factor for length in maps[0].shape[1::-1]]
+    size = [max(length // factor, 1) for length in maps[0].shape[1::-1]]
     return [cv2.resize(map_.astype(np.float32), size, interpolation=cv2.INTER_AREA) for map_ in maps]
 
 
@@ -229,11 +234,11 @@ def common_acceleration(flights: Sequence[Flight]) -> np.ndarray | None:
     if len(seen) < FEWEST_AGREEING:
         return None
     lengths = np.linalg.norm(seen, axis=1)
-    agree = np.linalg.norm(seen[:, None] - seen[None], axis=-1) < AGREE * lengths[:, None]
-    most = int(np.argmax(agree.sum(1)))
-    if agree[most].sum() < max(FEWEST_AGREEING, 0.3 * len(seen)):
-        return None
-    return np.asarray(np.median(seen[agree[most]], axis=0))
+    # One by one: a long recording has thousands, whose pairs would fill the memory.
+    each = (np.linalg.norm(seen - one, axis=1) < AGREE * length for one, length in zip(seen, lengths))
+    agree = max(each, key=np.count_nonzero)
+    enough = agree.sum() >= max(FEWEST_AGREEING, 0.3 * len(seen))
+    return np.asarray(np.median(seen[agree], axis=0)) if enough else None
 
 
 def same_region(a: np.ndarray, b: np.ndarray) -> bool:

@@ -120,7 +120,7 @@ def sigma_colors(sigma: np.ndarray, depth: np.ndarray) -> np.ndarray:
 
 
 def _row(cv2: ModuleType, image: np.ndarray, prior: DepthPrior, caption: str, width: int) -> np.ndarray:
-    size = (width, round(width * image.shape[0] / image.shape[1]))
+    size = (width, min(max(1, round(width * image.shape[0] / image.shape[1])), 10 * width))
     depth, labels = prior.depth.numpy(), prior.labels.numpy()
     sigma = np.full(depth.shape, np.inf, np.float32) if prior.sigma is None else prior.sigma.numpy()
     # Of a far pixel only a lower bound is known, so it takes no part in the colours of depth and sigma.

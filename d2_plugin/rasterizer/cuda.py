@@ -22,6 +22,7 @@ from d2_plugin.compiler.kernels import fields
 from d2_plugin.compiler.nvrtc import Binary, NoCuda, Program, build
 from d2_plugin.errors import D2Error
 from d2_plugin.rasterizer.native import KERNELS, RECORD, SLOWER, Pinhole, PointingFrame
+from d2_plugin.rasterizer.reference import refuse_skew
 
 PROGRAM = Program(KERNELS / "gpu.cu", (KERNELS / "splat.h",))
 
@@ -153,8 +154,7 @@ def _count_pairs(ends: Tensor, K: Tensor) -> int:
     last = ends[-1] if len(ends) else ends.new_zeros(())
     pairs, skewed = torch.stack([last, (K[0, 1] != 0).to(last)]).tolist()
     if skewed:
-        skew = K[0, 1].item()
-        raise D2Error(f"K has skew {skew}, expected 0: undistort the images to a pinhole camera without skew")
+        refuse_skew(K[0, 1].item())
     if pairs > MOST_PAIRS:
         raise D2Error(f"{pairs} pairs of Gaussian and tile, at most 2^31 - 1 are possible: use a smaller image")
     return pairs

@@ -113,7 +113,7 @@ def project(frame: Frame, means: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
         raise MemoryError(f"no memory for the projection of {len(means)} Gaussians")
     if pairs > 2**31 - 1:
         raise D2Error(f"{pairs} pairs of Gaussian and tile, at most 2^31 - 1 are possible: use a smaller image")
-    lists = torch.empty(3 * pairs + len(means) + 1 + 2 * tiles, dtype=torch.int32)
+    lists = means.new_empty(3 * pairs + len(means) + 1 + 2 * tiles, dtype=torch.int32)
     point_lists(frame, lists)
     return records, lists
 
@@ -145,7 +145,7 @@ def gather(frame: Frame, device: torch.device) -> None:
 
 
 def _over_background(frame: Frame) -> Frame:
-    return frame if frame.background else frame.pointing(background=torch.zeros(frame.channels))
+    return frame if frame.background else frame.pointing(background=torch.zeros(frame.channels, device="cpu"))
 
 
 def _run(step: Callable[[Frame, int], bool], frame: Frame) -> None:

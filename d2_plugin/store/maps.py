@@ -84,7 +84,7 @@ class CodedPrior(NamedTuple):
         colors = np.empty((*stored.shape, 3), np.uint8)
         for channel in range(3):  # five times as fast as all three at once
             colors[..., channel] = stored["color"][..., channel]
-        depth, labels, sigma = (np.ascontiguousarray(stored[name]) for name in ("depth", "label", "sigma"))
+        depth, labels, sigma = (np.array(stored[name]) for name in ("depth", "label", "sigma"))
         planes = depth.astype("<u2", copy=False).view(np.int16), labels, colors, sigma
         return cls(DepthPrior(*map(torch.from_numpy, planes)), depth_range)
 

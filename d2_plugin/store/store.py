@@ -250,13 +250,15 @@ class PriorStore:
         (entries or self.entries).write(camera, frame, codes, about)
 
     @contextmanager
-    def building(self, root: Path) -> Iterator[None]:
-        """Write priors beside other processes that do; `root` is the folder that `create` was given.
+    def building(self) -> Iterator[None]:
+        """Write priors beside other processes that do, also of other cameras in the same folder.
 
         The first of them removes what killed builds left, and what is damaged.
         """
-
         from d2_plugin.locks import in_turn, one_of_many
+
+        above = self.path.parents[1] if self.path.parent.name == OTHERS else self.path
+        root = above if (above / "store.json").is_file() else self.path
 
         def tidy() -> None:
             with in_turn(root):
@@ -281,9 +283,9 @@ _OTHER_NAMES = (
 
 
 def _joined(cameras: Sequence[str]) -> str:
-    """A folder's name for a set of cameras."""
+    """A folder's name for a set of cameras; no other set has it."""
     names = "+".join(sorted(cameras))
-    plain = re.fullmatch(r"[\w.+-]{1,80}", names) and set(names) != {"."}
+    plain = re.fullmatch(r"[\w.+-]{1,80}", names) and set(names) != {"."} and names.count("+") < len(cameras)
     return names if plain else hash_of(sorted(cameras))
 
 

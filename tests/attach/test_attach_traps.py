@@ -50,13 +50,9 @@ READERS = [
 class TestNames:
     """Which camera and frame of the prior a trainer's camera object stands for."""
 
-    def test_a_name_without_a_camera_is_refused_with_the_way_out(self) -> None:
+    def test_a_moving_camera_has_a_prior_for_each_image_and_no_camera_or_a_time_between_frames_is_refused(self) -> None:
         refuses(r"image '0003.png' does not say its camera.*function `key`", key_from_image_name, "0003.png")
-
-    def test_a_moving_camera_has_a_prior_for_each_image(self) -> None:
         assert one_image_each(SimpleNamespace(image_name="r_014.png")) == ("r_014", 0)
-
-    def test_a_time_between_frames_is_refused(self) -> None:
         assert frame_of_time(0.06, 50, first=10) == 13
         refuses(r"time 0.0333333 is frame 1.67 of 50", frame_of_time, 1 / 30, 50)
 
@@ -65,6 +61,8 @@ class TestNames:
         keys = KeysByPose(poses, lambda camera: round(2 * camera.timestamp))
         camera = cameras_of(timestamp=lambda view: view.time)[5]
         assert keys(camera) == ("cam2", 1)
+        camera.timestamp += 1  # one object that goes through time
+        assert keys(camera) == ("cam2", 3)
         camera.world_view_transform = camera.world_view_transform + 0.5
         refuses("stands at none of the known poses", keys, camera)
 

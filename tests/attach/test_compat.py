@@ -44,7 +44,7 @@ class TestThreeDGS:
         assert radii.dtype == torch.int32
         assert color.is_contiguous(), "trainers call `.view(-1)`"
 
-    def test_camera_is_recovered_from_the_two_matrices(self) -> None:
+    def test_camera_is_recovered_from_the_two_matrices(self, camera: dict) -> None:
         turn = torch.linalg.qr(torch.randn(3, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1)))[0]
         pose = torch.eye(4, dtype=torch.float64)
         pose[:3, :3], pose[:3, 3] = turn * torch.linalg.det(turn), torch.tensor([0.3, -0.2, 1.5])
@@ -53,9 +53,7 @@ class TestThreeDGS:
         result = inria.view_of(inria.GaussianRasterizationSettings(**inria_camera(view)))
         torch.testing.assert_close(result.K, K, atol=1e-4, rtol=0)
         torch.testing.assert_close(result.T_camera_world, pose.float(), atol=1e-6, rtol=0)
-
-    def test_matrices_may_come_as_a_batch_of_one(self, camera: dict) -> None:
-        """As in the cameras that 4DGaussians makes for PanopticSports."""
+        # A batch of one, as in the cameras that 4DGaussians makes for PanopticSports.
         batched = {**camera, "viewmatrix": camera["viewmatrix"][None], "projmatrix": camera["projmatrix"][None]}
         result = inria.view_of(inria.GaussianRasterizationSettings(**batched))
         torch.testing.assert_close(result.K, view_24x16().K, atol=1e-5, rtol=0)
@@ -180,7 +178,7 @@ class TestNearest:
 
 
 class TestSSIM:
-    def test_is_the_mean_over_the_batch_of_3dgs_similarity(self) -> None:
+    def test_is_the_mean_over_the_batch_of_3dgs_similarity_and_another_padding_is_refused(self) -> None:
         a = torch.rand(2, 3, 20, 24, generator=torch.Generator().manual_seed(0)).requires_grad_()
         b = a.detach().roll(1, -1)
         result = vision.fused_ssim(a, b)
@@ -189,8 +187,6 @@ class TestSSIM:
         assert vision.fused_ssim(a, a.detach()).item() == pytest.approx(1.0, abs=1e-5)
         result.backward()
         assert a.grad.abs().sum() > 0
-
-    def test_another_padding_is_refused(self) -> None:
         with pytest.raises(D2Error, match="this stand-in has 'same' only"):
             vision.fused_ssim(torch.rand(1, 3, 12, 12), torch.rand(1, 3, 12, 12), padding="valid")
 
@@ -212,28 +208,18 @@ class TestFourD:
     def test_slices_like_the_cuda_source(self, camera: dict, name: str) -> None:
         mean, t0, scales, left, right, t, sliced, covariance, marginal, _, _ = GOLDEN[name]
         left, right = (torch.tensor([q], dtype=torch.float64) for q in (left, right))
-        arguments = {
-            "means3D": torch.tensor([mean], dtype=torch.float64),
-            "means2D": torch.zeros(1, 3),
-            "opacities": torch.tensor([[0.9]], dtype=torch.float64),
-            "colors_precomp": torch.ones(1, 3, dtype=torch.float64),
-            "ts": torch.tensor([[t0]], dtype=torch.float64),
-            "scales": torch.tensor([scales[:3]], dtype=torch.float64),
-            "scales_t": torch.tensor([scales[3:]], dtype=torch.float64),
-            "rotations": left / left.norm(),
-            "rotations_r": right / right.norm(),
-        }
+        numbers = {"opacities": [0.9], "ts": [t0], "scales": scales[:3], "scales_t": scales[3:], "means3D": mean}
+        arguments = {name: torch.tensor([value], dtype=torch.float64) for name, value in numbers.items()}
+        arguments |= {"means2D": torch.zeros(1, 3), "colors_precomp": torch.ones(1, 3, dtype=torch.float64)}
+        arguments |= {"rotations": left / left.norm(), "rotations_r": right / right.norm()}
         at = {**camera, **FOUR, "timestamp": t, "force_sh_3d": False}
         raster = fourd.GaussianRasterizer(fourd.GaussianRasterizationSettings(**at))
         *_, covariances = raster(**arguments)
         np.testing.assert_allclose(covariances[0], covariance, atol=1e-8)
-        expected = fourd.inria.GaussianRasterizer(fourd.inria.GaussianRasterizationSettings(**camera))(
-            torch.tensor([sliced], dtype=torch.float64),
-            torch.zeros(1, 3),
-            torch.tensor([[0.9 * marginal]], dtype=torch.float64),
-            colors_precomp=arguments["colors_precomp"],
-            cov3D_precomp=torch.tensor([covariance], dtype=torch.float64),
-        )[0]
+        numbers = {"means3D": sliced, "opacities": [0.9 * marginal], "cov3D_precomp": covariance}
+        three = {name: torch.tensor([value], dtype=torch.float64) for name, value in numbers.items()}
+        three |= {name: arguments[name] for name in ("means2D", "colors_precomp")}
+        expected = inria.GaussianRasterizer(inria.GaussianRasterizationSettings(**camera))(**three)[0]
         torch.testing.assert_close(raster(**arguments)[0], expected, atol=1e-5, rtol=1e-5)
 
     def test_passes_gradcheck_through_time(self, camera: dict) -> None:

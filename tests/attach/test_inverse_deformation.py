@@ -75,8 +75,9 @@ def test_every_point_is_inverted_at_its_own_time() -> None:
 @pytest.mark.parametrize("count", [1, 7, 300])
 def test_the_nearest_gaussian_lends_its_offset_even_far_from_the_origin(count: int) -> None:
     shift = torch.tensor([1e4, -2e4, 5e3])
-    means = targets_of(count, seed=1) + shift
-    offsets = torch.arange(3.0 * count).view(count, 3)
-    exact = torch.cdist(targets_of().double(), (means - shift).double(), compute_mode="donot_use_mm_for_euclid_dist")
+    means = torch.cat([targets_of(count, seed=1) + shift, torch.full((1, 3), torch.nan)])  # the last one is nowhere
+    offsets = torch.arange(3.0 * count + 3).view(-1, 3)
+    there = (means[:-1] - shift).double()
+    exact = torch.cdist(targets_of().double(), there, compute_mode="donot_use_mm_for_euclid_dist")
     lent = neighbour_offsets(targets_of() + shift, means, offsets)
     assert (lent == offsets[exact.argmin(1)]).all(1).float().mean() > 0.97

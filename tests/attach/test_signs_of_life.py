@@ -8,6 +8,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+import torch
 from mimics import fudan
 from mimics.page import attached
 from tiny import ALL_HOOKS, TinyFrames, TinyStore, make_adapter, make_model
@@ -15,7 +16,7 @@ from tiny import ALL_HOOKS, TinyFrames, TinyStore, make_adapter, make_model
 from d2_plugin import D2Config, D2Hooks
 from d2_plugin.backbones.trainer import Trainer, TrainSettings
 from d2_plugin.hooks import reports
-from d2_plugin.hooks.reports import Report
+from d2_plugin.hooks.reports import Report, RunLog
 
 
 def lines(caplog: pytest.LogCaptureFixture) -> list[str]:
@@ -73,12 +74,23 @@ def test_a_camera_without_prior_is_warned_of_once_with_those_that_have_one(caplo
         def prior(self, camera: str, frame: int):
             return super().prior(camera, frame) if camera == "cam0" else None
 
-    logged(D2Config(depth_loss=ALL_HOOKS.depth_loss), OneCamera()).run()
+    trainer = logged(D2Config(depth_loss=ALL_HOOKS.depth_loss), OneCamera())
+    trainer.d2.backbone.image = lambda camera: torch.zeros(3, camera.height, camera.width)
+    trainer.run()
+    assert not trainer.d2.prior.images  # nothing that waits for a prior that never comes
     warned = [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
     assert len(warned) == 2
     for camera, line in zip(("cam1", "cam2"), sorted(warned), strict=True):
         assert line.startswith(f"camera {camera} has no prior at frame ")
         assert line.endswith("trained without D2 there; the prior has cameras cam0")
+
+
+def test_a_loss_at_last_is_that_of_the_last_steps_where_nothing_was_read_in_between() -> None:
+    run = RunLog({})
+    run.start([], None, None, None, None)
+    for step in range(1000):
+        run.record_loss("depth_loss", torch.tensor(float(step < 500)))
+    assert run.summary().endswith("depth_loss 1 at first, 0.00657 at last")
 
 
 class TestSchedules:

@@ -38,9 +38,7 @@ class Sliced(NamedTuple):
             assert torch.isfinite(tensor).all(), name
 
 
-def sliced(
-    slice_in: Callable, dtype: torch.dtype, rows: Mapping[str, Tensor], at=AT, weighed=True, used=slice(None)
-) -> Sliced:
+def sliced(slice_in: Callable, dtype: torch.dtype, rows: Mapping, at=AT, weighed=True, used=slice(None)) -> Sliced:
     """The slice by `slice_in`, and gradients of the sum of the outputs `used`, `weighed` by a fixed noise or not."""
     raw = {name: value.to(dtype, copy=True).requires_grad_() for name, value in rows.items()}
     *outputs, drawn = slice_in(raw, at, *CONSTANTS)
@@ -156,15 +154,9 @@ def take_slice(request: pytest.FixtureRequest) -> Callable[..., Sliced]:
 
 def axis_aligned(scales: tuple[float, float, float], time_scale: float, time: float = 0.0) -> dict[str, Tensor]:
     """One Gaussian at (1, 2, 3) that does not move."""
-    return {
-        "positions": torch.tensor([[1.0, 2, 3]]),
-        "log_scales": torch.tensor([scales]).log(),
-        "left": IDENTITY[None].clone(),
-        "opacity_logits": torch.zeros(1),
-        "times": torch.tensor([time]),
-        "log_time_scales": torch.tensor([time_scale]).log(),
-        "right": IDENTITY[None].clone(),
-    }
+    still = {"left": IDENTITY[None].clone(), "right": IDENTITY[None].clone(), "opacity_logits": torch.zeros(1)}
+    wide = {"log_scales": torch.tensor([scales]).log(), "log_time_scales": torch.tensor([time_scale]).log()}
+    return still | wide | {"positions": torch.tensor([[1.0, 2, 3]]), "times": torch.tensor([time])}
 
 
 def test_a_zero_quaternion_is_the_identity_and_receives_no_gradient(take_slice, temporal: bool) -> None:

@@ -85,6 +85,12 @@ class TestRender:
         assert not by_depth.any()
         torch.testing.assert_close(by_alpha.float(), torch.where(near, -DepthLossConfig().opaque / near.sum(), 0.0))
 
+    def test_a_render_of_16_bits_counts_more_pixels_than_16_bits_can(self) -> None:
+        prior, render = prior_of(0, 300, 400, (Label.VERIFIED,), paper=True), render_of(300, 400)
+        known, config = KnownMaps.of(prior), replace(PAPER, tau_v=0)
+        half, full = (supervision(*(part.to(t) for part in render), known, config) for t in (torch.half, torch.float))
+        torch.testing.assert_close(half, full, rtol=1e-2, atol=0)
+
 
 @pytest.mark.usefixtures("compiler")
 class TestKernel:

@@ -16,16 +16,18 @@ import numpy as np
 import pytest
 import tiny_onnx
 import torch
-from prior_cases import contents, showing
+from prior_cases import camera_at, contents, showing
 from refusals import refuses
 
 from d2_plugin.errors import D2Error, MissingExtra
 from d2_plugin.priors.build import PriorSummary, build_priors
 from d2_plugin.priors.construct import NO_MAP, SCALE_UNKNOWN
 from d2_plugin.priors.dask_build import build_priors_on_cluster
+from d2_plugin.priors.frame import Frame
 from d2_plugin.priors.monocular.align import align
 from d2_plugin.priors.settings import PriorSettings, StereoSettings
 from d2_plugin.priors.stereo import matched_depth
+from d2_plugin.priors.stereo.depth_range import DepthBounds
 from d2_plugin.protocol import Label
 from d2_plugin.recordings import open_recording
 from d2_plugin.recordings.export.folder import save_recording
@@ -137,32 +139,21 @@ def test_a_second_build_computes_nothing_and_changes_nothing(plain: Recording, b
 
 
 @pytest.mark.parametrize(
-    ("change", "again"),
-    [
-        ({"max_pixels": 10_000}, True),
-        ({"seed": 1}, True),
-        ({"reuse_block": 7}, False),
-        ({"patchmatch_device": "cpu"}, False),
-    ],
+    "change", [{"max_pixels": 10_000}, {"seed": 1}, {"reuse_block": 7}, {"patchmatch_device": "cpu"}]
 )
-def test_views_are_matched_again_where_a_setting_that_matters_changed(plain, begun, monkeypatch, change, again) -> None:
+def test_views_are_matched_again_where_a_setting_that_matters_changed(plain, begun, monkeypatch, change) -> None:
     no_stereo(monkeypatch)
     settings = replace(SETTINGS, stereo=replace(SETTINGS.stereo, **change))
-    with pytest.raises(AssertionError) if again else contextlib.nullcontext():
+    with pytest.raises(AssertionError) if {"max_pixels", "seed"} & {*change} else contextlib.nullcontext():
         build_priors(plain, NAMES, begun, settings)
 
 
-@pytest.mark.parametrize(
-    ("strict", "loose"),
-    [
-        ({"uncertainty": False}, {"uncertainty": False, "tau_c": 0.5}),
-        ({"conflict_sigmas": 0.5, "most_vetoed": 1.0}, {"conflict_sigmas": 3.0, "most_vetoed": 1.0}),
-    ],
-)
-def test_other_fusion_settings_reuse_the_stereo_cache(plain, begun, monkeypatch, strict, loose) -> None:
+@pytest.mark.parametrize("change", [{"uncertainty": False}, {"conflict_sigmas": 0.5, "most_vetoed": 1.0}])
+def test_other_fusion_settings_reuse_the_stereo_cache(plain, begun, monkeypatch, change) -> None:
     no_stereo(monkeypatch)
-    strict = build_priors(plain, NAMES, begun, replace(SETTINGS, agreement=0.0, **strict))
-    loose = build_priors(plain, NAMES, begun, replace(SETTINGS, agreement=0.0, **loose))
+    settings = replace(SETTINGS, agreement=0.0, **change)
+    strict = build_priors(plain, NAMES, begun, settings)
+    loose = build_priors(plain, NAMES, begun, replace(settings, tau_c=0.5, conflict_sigmas=3.0))
     assert loose.built == 6
     assert loose.shares["train0"]["verified"] > strict.shares["train0"]["verified"]
     assert loose.shares["train0"]["mono"] == strict.shares["train0"]["mono"]
@@ -226,13 +217,12 @@ def test_without_monocular_depth_geometric_depth_stands_alone_and_that_is_said(p
     assert set(np.unique(store.prior("train0", 0).labels)) == {Label.EMPTY, Label.VERIFIED}
 
 
-def test_one_camera_has_no_depth_from_a_relative_map(plain: Recording, tmp_path: Path) -> None:
+def test_one_camera_has_no_depth_from_a_relative_map_and_without_one_no_source_at_all(
+    plain: Recording, tmp_path: Path
+) -> None:
     summary = build_priors(plain, NAMES[:1], tmp_path, SETTINGS)
     assert [reason for _, _, reason in summary.refused] == [SCALE_UNKNOWN] * 2
     assert "one camera" in str(summary)
-
-
-def test_no_source_at_all_is_an_error(plain: Recording, tmp_path: Path) -> None:
     refuses("has no depth source", build_priors, replace(plain, mono_kind=None), NAMES[:1], tmp_path / "p", SETTINGS)
     assert not (tmp_path / "p").exists()
 
@@ -283,18 +273,24 @@ def test_a_network_is_asked_once_per_image(plain: Recording, begun: Path, tmp_pa
     refuses("mono_kind = relative", build_priors, plain, NAMES, tmp_path / "other", replace(settings, mono_kind=None))
 
 
-@pytest.mark.parametrize(
-    ("names", "change", "message"),
-    [
-        (["train0", "cam7"], {}, "unknown camera 'cam7'"),
-        ([], {}, "name at least one"),
-        (["train0", "train0"], {}, "named twice"),
-        (NAMES, {"mono_kind": "metric"}, "declared relative"),
-    ],
-)
-def test_mistakes_are_told_before_anything_is_written(plain, tmp_path, names, change, message) -> None:
-    refuses(message, build_priors, plain, names, tmp_path / "p", replace(SETTINGS, **change))
+def test_mistakes_are_told_before_anything_is_written(plain: Recording, tmp_path: Path) -> None:
+    wrong = {"unknown camera 'cam7'": ["train0", "cam7"], "name at least one": [], "named twice": ["train0", "train0"]}
+    for message, names in wrong.items():
+        refuses(message, build_priors, plain, names, tmp_path / "p", SETTINGS)
+    refuses("declared relative", build_priors, plain, NAMES, tmp_path / "p", replace(SETTINGS, mono_kind="metric"))
     assert not (tmp_path / "p" / "priors").exists()
+
+
+def test_a_build_goes_on_late_in_a_block_of_any_length(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    matched, settings = [], StereoSettings(reuse_block=2000)
+    monkeypatch.setattr(matched_depth, "geometric_depth", lambda images, *_: matched.extend(images) or [])
+    frames = [Frame(number, {"camera": number}, {"camera": str(number)}) for number in range(1200)]
+    cameras, bounds = [camera_at(size=(1, 1))], DepthBounds(1, 2, "")
+    source = matched_depth.MatchedDepth(cameras, bounds, settings, tmp_path, range(1200), frames.__getitem__)
+    for frame in frames:
+        source.key(frame)
+    source._computed(frames[-1])
+    assert matched == list(range(1200))
 
 
 REUSE = PriorSettings(stereo=StereoSettings(matcher="patchmatch", reuse_block=3))

@@ -11,7 +11,7 @@ import pytest
 import tiny_onnx
 from hypothesis import given
 from hypothesis import strategies as st
-from prior_cases import contents, showing, write_multiview
+from prior_cases import camera_at, contents, showing, write_multiview
 from refusals import refuses
 
 from benchmarks.emulated_multiview import emulated_multiview
@@ -168,6 +168,9 @@ def test_maps_tell_their_scale_without_poses_and_overrule_wrong_ones(room: Recor
         assert world_scale(depth, room.cameras, poses) == pytest.approx(100, rel=0.05)
     assert world_scale(depth, room.cameras, right) == pytest.approx(100, rel=1e-6)
     assert np.isnan(world_scale({"train0": depth["train0"]}, {"train0": room.cameras["train0"]}, None))
+    back_to_back = {name: camera_at((i, 0, 0), i * np.pi, size=(160, 90)) for i, name in enumerate(NAMES[:2])}
+    for one in (depth["train0"], np.full_like(depth["train0"], np.nan)):
+        assert np.isnan(world_scale({"train0": one, "train1": depth["train1"]}, back_to_back, None))
 
 
 @pytest.mark.parametrize(("unit", "power"), [(1.0, 1.0), (1e-6, 0.5), (1e6, 1.5), (1.0, -1.0), (1.0, 5.0)])

@@ -5,6 +5,8 @@ The GPU's run on the CPU (`shim`: the same .cu source and host code) and, where 
 
 import functools
 import os
+import subprocess
+import sys
 import warnings
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -226,12 +228,11 @@ def test_without_a_compiler_the_torch_path_takes_over_with_one_warning(monkeypat
     scene = random_scene(14, 50, 20, 20).on(Path(torch.float32))
     native.library.cache_clear()
     native.available.cache_clear()
-    with monkeypatch.context() as patch:
+    with monkeypatch.context() as patch, warnings.catch_warnings(record=True) as caught:
         patch.setenv("CXX", "no-such-compiler")
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
-            slow = scene.render()
-            scene.render()
+        warnings.simplefilter("always")
+        slow = scene.render()
+        scene.render()
         (message,) = [str(warning.message) for warning in caught]
         assert "no-such-compiler" in message
         assert "orders of magnitude slower" in message
@@ -245,6 +246,28 @@ def test_an_image_as_wide_as_a_panorama_has_its_gaussians_in_place(kernels: Path
     alpha = scene.on(kernels).render().alpha.cpu()
     assert alpha.argmax().item() == 5000 + 4900
     torch.testing.assert_close(alpha.double(), scene.render().alpha, atol=1e-4, rtol=0)
+
+
+NO_MEMORY = """
+import contextlib, torch, resource as system
+from d2_plugin.rasterizer import Splats, View, rasterize
+splats = Splats(torch.tensor([[0, 0, 2.0]]), torch.tensor([[1.0, 0, 0, 1, 0, 1]]), torch.ones(1), torch.arange(1))
+view = View("cam", 0, 0.0, torch.eye(4), torch.tensor([[30.0, 0, 60], [0, 30, 1], [0, 0, 1]]), 120, 2)
+torch.set_default_device("meta")  # where nothing of a scene on the CPU may lie
+rasterize(splats, torch.ones(1, 3, device="cpu"), view)
+used = system.getpagesize() * int(open("/proc/self/statm").read().split()[0])
+system.setrlimit(system.RLIMIT_AS, (used + 2**30,) * 2)
+for channels in (400_000, 390_000, 5):
+    with contextlib.suppress(MemoryError):
+        print(channels, rasterize(splats, torch.ones(1, channels, device="cpu"), view).alpha.max().item())
+"""
+
+
+@pytest.mark.skipif(not File("/proc/self/statm").exists(), reason="the system does not say what a process takes")
+@pytest.mark.usefixtures("compiler")
+def test_a_call_without_memory_says_so_and_the_next_one_draws() -> None:
+    done = subprocess.run([sys.executable, "-c", NO_MEMORY], capture_output=True, text=True, timeout=600, check=True)
+    assert done.stdout.startswith("5 0.99")
 
 
 def test_more_pairs_than_slots_can_number_are_refused() -> None:

@@ -133,7 +133,7 @@ def shared_scale(maps: Mapping[str, np.ndarray], cameras: Mapping[str, Camera], 
         return float(_match(np.concatenate(apart)).mean()) if enough else 0.0
 
     factor = 1.0
-    for _ in range(2 if len(shown) > 1 else 0):
+    for _ in range(min(2, len(tried)) if len(shown) > 1 else 0):
         best = int(np.argmax([matched(factor) for factor in tried]))
         around = tried[max(best - 1, 0)], tried[min(best + 1, len(tried) - 1)]
         factor, tried = float(tried[best]), np.geomspace(*around, 2 * FINER + 1)

@@ -53,6 +53,8 @@ LEAST = 200
 USUAL, EVIDENCE = 0.12, 3000
 """The scale of most maps, and how many anchors (at `WIDTH`) weigh as much: a few that lie together are held from near
 by, and do not make a map surer than usual."""
+TRUE = 1e-9
+"""The scale of a map without any error: not 0, which its tail is divided by."""
 IN_TAIL, USUAL_TAIL = 0.98, 3.0
 """A quantile far out, and where it lies in maps that belong to their images, in units of the scale (2.33 if errors
 were normal)."""
@@ -140,8 +142,9 @@ def measured_skill(
     """Errors at anchors [H, W] that were left out of the correction of `aligned` [H, W]."""
     holes, both = left_out_regions(anchors.shape), (anchors > 0) & (aligned > 0)
     held, rest = holes & both, ~holes & (anchors > 0)
-    enough = (_count(held) >= 20) & (_count(rest) >= max(settings.min_anchors, 1))
-    if _count(held[enough]).sum() < LEAST:
+    left_out, others = (np.count_nonzero(masks, axis=(1, 2)) for masks in (held, rest))
+    enough = (left_out >= 20) & (others >= max(settings.min_anchors, 1))
+    if left_out[enough].sum() < LEAST:
         return Skill(np.nan, np.nan, np.nan, np.nan)
     holes, rest = holes[enough], rest[enough]
     corrected = corrected_without(aligned, anchors, holes, settings)
@@ -211,11 +214,6 @@ def error_shape(depth: np.ndarray, anchors: np.ndarray, at: np.ndarray | None = 
     return usual, np.sqrt(sum(own, FLOOR**2 + next_near))
 
 
-def _count(masks: np.ndarray) -> np.ndarray:
-    """How many pixels each of the masks [n, H, W] has."""
-    return np.array([np.count_nonzero(mask) for mask in masks], np.int64)
-
-
 def _log_error(depth: np.ndarray, anchors: np.ndarray, place: np.ndarray) -> np.ndarray:
     """|log(depth / anchor)| [n] at pixels that are given by flat index."""
     return np.abs(np.log(depth.ravel()[place] / anchors.ravel()[place]))
@@ -223,7 +221,7 @@ def _log_error(depth: np.ndarray, anchors: np.ndarray, place: np.ndarray) -> np.
 
 def _scale(ratios: np.ndarray, anchors: int) -> float:
     """The 68 % quantile of errors in units of their shape, from few anchors not below what is usual."""
-    measured = float(np.quantile(ratios, 0.68))
+    measured = max(float(np.quantile(ratios, 0.68)), TRUE)
     share = anchors / (anchors + EVIDENCE)
     return float(max(measured, measured**share * USUAL ** (1 - share)))
 

@@ -61,8 +61,10 @@ def world_scale(maps: Mapping[str, np.ndarray], cameras: Mapping[str, Camera], p
         return np.nan
     shared = shared_scale(maps, cameras, span / float(np.median(depth)) * ANY)
     given = np.nan if poses is None else pose_scale(poses, list(cameras.values()))
-    agreed = min((fit.matched for fit in shared.agreements.values()), default=0.0) >= AGREES
-    return given if given > 0 and (not agreed or abs(np.log(given / shared.scale)) < CLOSE) else shared.scale
+    matched = [fit.matched for fit in shared.agreements.values()]
+    if given > 0 and (min(matched, default=0.0) < AGREES or abs(np.log(given / shared.scale)) < CLOSE):
+        return given
+    return shared.scale if any(matched) else np.nan
 
 
 def log_ratio(now: np.ndarray, before: np.ndarray) -> float:

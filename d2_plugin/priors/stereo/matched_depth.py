@@ -56,15 +56,22 @@ class MatchedDepth(GeometricSource):
 
     def _computed(self, frame: Frame) -> list[GeometricDepth]:
         """D^g per camera at one frame. A build that goes on within a block matches the frames before it again."""
-        key, before = self.key(frame), self._before.get(frame.number)
-        if before is None:
+        self.key(frame)
+        missing = [frame.number]
+        while (before := self._before.get(missing[-1])) is not None and self._remembered != self._keys[before]:
+            missing.append(before)
+        for number in missing[:0:-1]:
+            self._matched(self.read(number))
+        return self._matched(frame)
+
+    def _matched(self, frame: Frame) -> list[GeometricDepth]:
+        """The same once the frame before it, if it has one, was matched last."""
+        if frame.number not in self._before:
             self._memories = _memories()
-        elif self._remembered != self._keys[before]:
-            self._computed(self.read(before))
         images = [frame.images[camera.name] for camera in self.cameras]
         memories = self._memories if self.settings.reuse_static else None
         results = geometric_depth(images, self.cameras, self.depth_range, self.settings, memories)
-        self._remembered = key
+        self._remembered = self._keys[frame.number]
         matched_share = 1.0 if memories is None else round(memories[0].matched_share, 6)
         return [replace(result, record=result.record | {"matched_share": matched_share}) for result in results]
 

@@ -101,12 +101,13 @@ class Buffer {
   T* reserve(size_t count) {
     if (count > capacity_) {
       std::free(data_);
-      capacity_ = count + count / 4;
-      const size_t page = size_t(2) << 20, bytes = capacity_ * sizeof(T);
-      const size_t alignment = bytes < page ? 64 : page;
-      data_ = static_cast<T*>(std::aligned_alloc(alignment, (bytes + alignment - 1) / alignment * alignment));
+      capacity_ = 0;  // so that a call after one without memory asks again
+      const size_t page = size_t(2) << 20, wanted = (count + count / 4) * sizeof(T);
+      const size_t alignment = wanted < page ? 64 : page, bytes = (wanted + alignment - 1) / alignment * alignment;
+      data_ = static_cast<T*>(std::aligned_alloc(alignment, bytes));
       if (!data_) throw std::bad_alloc();
-      ask_for_large_pages(data_, (bytes + alignment - 1) / alignment * alignment);
+      capacity_ = count + count / 4;
+      ask_for_large_pages(data_, bytes);
     }
     return data_;
   }

@@ -9,6 +9,7 @@
 #include <condition_variable>
 #include <cstdint>
 #include <mutex>
+#include <new>
 #include <system_error>
 #include <thread>
 
@@ -18,7 +19,8 @@ class Pool {
  public:
   typedef void (*Task)(void* context, int64_t index);
 
-  // Run task(context, i) for i in 0..count-1 on up to `threads` threads; returns when all are done.
+  // Run task(context, i) for i in 0..count-1 on up to `threads` threads; returns when all are done, or throws where a
+  // task found no memory.
   static void run(int threads, int64_t count, Task task, void* context) {
     Pool& pool = instance();
     // A second caller at the same time works alone rather than waiting.
@@ -26,8 +28,9 @@ class Pool {
       for (int64_t i = 0; i < count; i++) task(context, i);
       return;
     }
-    pool.work(threads, count, task, context);
+    const bool done = pool.work(threads, count, task, context);
     pool.owner_.unlock();
+    if (!done) throw std::bad_alloc();
   }
 
  private:
@@ -45,7 +48,7 @@ class Pool {
     return *current;
   }
 
-  void work(int threads, int64_t count, Task task, void* context) {
+  bool work(int threads, int64_t count, Task task, void* context) {
     {
       std::lock_guard<std::mutex> lock(mutex_);
       try {
@@ -64,10 +67,15 @@ class Pool {
       places_ = 0;
     }
     while (busy_.load(std::memory_order_acquire)) sched_yield();
+    return !failed_.exchange(false);
   }
 
   void take_tasks(Task task, void* context, int64_t count) {
-    for (int64_t i; (i = next_.fetch_add(1, std::memory_order_relaxed)) < count;) task(context, i);
+    try {
+      for (int64_t i; (i = next_.fetch_add(1, std::memory_order_relaxed)) < count;) task(context, i);
+    } catch (const std::bad_alloc&) {
+      failed_.store(true);
+    }
   }
 
   void serve() {
@@ -103,6 +111,7 @@ class Pool {
   std::atomic<unsigned> generation_{0};
   std::atomic<int64_t> next_{0};
   std::atomic<int> busy_{0};
+  std::atomic<bool> failed_{false};
   int workers_ = 0, places_ = 0;
   Task task_ = nullptr;
   void* context_ = nullptr;

@@ -159,7 +159,7 @@ struct Projected {
 };
 
 // What the blur does to the area of a footprint: determinants of the screen covariance without and with it. The
-// difference of products cancels for thin Gaussians, by far less than LEAST_AREA of the blurred one.
+// difference of products cancels for thin Gaussians: beyond some thirty pixels of length it is noise above LEAST_AREA.
 template <class S>
 struct Area {
   S own_x, own_y, covariance;  // the screen covariance without the blur

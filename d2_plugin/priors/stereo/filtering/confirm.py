@@ -55,14 +55,11 @@ def confirm(
 
 
 class _Sums(NamedTuple):
-    """Over the sources so far; maps [H, W]."""
+    """Over the sources so far: how many confirm, sum of P^2, and of P^2 times the squared relative difference."""
 
-    confirming: np.ndarray
-    """uint8: how many sources."""
-    information: np.ndarray
-    """Sum of P^2, float64."""
-    difference: np.ndarray
-    """Sum of P^2 times the squared relative difference, float64."""
+    confirming: np.ndarray  # uint8 [H, W]
+    information: np.ndarray  # float64 [H, W]
+    difference: np.ndarray  # float64 [H, W]
 
 
 def _add_source(
@@ -79,20 +76,9 @@ def _add_source(
     pair, back = view_pair(reference, source), view_pair(source, reference)
     low, high = np.deg2rad(settings.min_angle), np.deg2rad(settings.max_angle)
     vectors = {"A": pair.A, "k": pair.k, "back_A": back.A, "back_k": back.k, "direction": pair.direction, "rays": rays}
-    kernel.run(
-        "confirm",
-        {"depth": depth, "theirs": theirs, **sums._asdict()},
-        **vectors,
-        their_height=theirs.shape[0],
-        their_width=theirs.shape[1],
-        between=settings.between_pixels,
-        continuous=CONTINUOUS,
-        reprojection_max=REPROJECTION_MAX,
-        relative_depth_max=tolerance,
-        sine_min=np.sin(low),
-        cosine_min=np.cos(low),
-        sine_max=np.sin(high),
-        cosine_max=np.cos(high),
-        nudge=np.exp(NUDGE),
-        nudge_squared=NUDGE**2,
-    )
+    angles = {"sine_min": np.sin(low), "cosine_min": np.cos(low), "sine_max": np.sin(high), "cosine_max": np.cos(high)}
+    limits = {"continuous": CONTINUOUS, "reprojection_max": REPROJECTION_MAX, "relative_depth_max": tolerance}
+    steps = {"between": settings.between_pixels, "nudge": np.exp(NUDGE), "nudge_squared": NUDGE**2}
+    sizes = dict(zip(("their_height", "their_width"), theirs.shape))
+    maps = {"depth": depth, "theirs": theirs, **sums._asdict()}
+    kernel.run("confirm", maps, **vectors, **angles, **limits, **steps, **sizes)

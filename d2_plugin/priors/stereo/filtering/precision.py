@@ -71,17 +71,8 @@ def geometric_sigma(
         "scatter": plane_scatter(depth),
         "sigma": np.empty(depth.shape, np.float32),
     }
-    kernel.run(
-        "sigma",
-        maps,
-        matching=MATCHING,
-        gray_noise=GRAY_NOISE,
-        flattest=FLATTEST,
-        per_incoherence=PER_INCOHERENCE,
-        of_scatter=OF_SCATTER,
-        of_spread=OF_SPREAD,
-        floor_squared=FLOOR**2,
-    )
+    numbers = {"matching": MATCHING, "gray_noise": GRAY_NOISE, "flattest": FLATTEST, "per_incoherence": PER_INCOHERENCE}
+    kernel.run("sigma", maps, **numbers, of_scatter=OF_SCATTER, of_spread=OF_SPREAD, floor_squared=FLOOR**2)
     return maps["sigma"]
 
 
