@@ -19,7 +19,7 @@ from d2_plugin.recordings.recording import Recording
 from d2_plugin.recordings.selection import spread
 from d2_plugin.runs import metrics
 from d2_plugin.runs.drawing import Panel, as_bytes, depth_panel, depth_scale, error_panel, side_by_side
-from d2_plugin.runs.lpips import Lpips, find_lpips
+from d2_plugin.runs.lpips import SMALLEST, Lpips, find_lpips
 from d2_plugin.runs.plan import CHANGED, MOVING_SHARE
 from d2_plugin.runs.scene import Scene
 from d2_plugin.runs.start import make_view
@@ -57,14 +57,16 @@ def evaluate_scene(model: Any, scene: Scene, device: torch.device | str, images:
     """`evaluate` at the test cameras of a scene; at its training cameras, under `train` instead of `test`, where it has
     none."""
     recording, cameras = scene.scored, scene.test_cameras or scene.train_cameras
-    frames = recording.frames
+    frames, lenses = recording.frames, [recording.cameras[name] for name in cameras]
+    large = min(min(camera.width, camera.height) for camera in lenses) >= SMALLEST
+    alex, vgg = (find_lpips(net) if large else None for net in ("alex", "vgg"))
     with progress_bar("evaluate", len(cameras) * len(frames)) as bar:
         scores = evaluate(
             renderer(model, recording, device),
             *(recording, cameras, frames, images),
             between=scene.between,
-            lpips=find_lpips("alex"),
-            lpips_vgg=find_lpips("vgg"),
+            lpips=alex,
+            lpips_vgg=vgg,
             progress=lambda done, _: bar.update(done),
         )
     return scores if scene.test_cameras else {"test": None, "train": scores.pop("test")} | scores

@@ -27,7 +27,7 @@ SHIFT = (-0.030, -0.088, -0.188)
 SCALE = (0.458, 0.448, 0.450)
 
 SMALLEST = 64
-"""Least width and height in pixels: below it the deepest features have no pixel left."""
+"""Least width and height in pixels: below it the deepest features are of two pixels each way, or of none."""
 
 _VGG16 = ((64, 2), (128, 2), (256, 3), (512, 3), (512, 3))
 """Width and number of the convolutions of each block; blocks are pooled in between."""

@@ -70,18 +70,13 @@ def _corrected(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
     return min(corrected, image, key=lambda one: float(np.square(one - truth).sum()))
 
 
-def ssim_range1(image: Tensor, truth: Tensor) -> float:
-    """SSIM_1: scikit-image's structural similarity for a data range of 1.
+def ssim_uniform(image: Tensor, truth: Tensor, data_range: float = 1.0) -> float:
+    """Scikit-image's structural similarity: uniform 7x7 window, sample covariance, mean over windows inside the image.
 
     >>> image = torch.rand(8, 9, 3)
-    >>> round(ssim_range1(image, image), 6)
+    >>> round(ssim_uniform(image, image), 6)
     1.0
     """
-    return ssim_uniform(image, truth, data_range=1.0)
-
-
-def ssim_uniform(image: Tensor, truth: Tensor, data_range: float) -> float:
-    """Structural similarity with a uniform 7x7 window and sample covariance, mean over windows inside the image."""
     first, second = _pair(image, truth, UNIFORM_WINDOW)
     count = UNIFORM_WINDOW**2
     taps = [1 / UNIFORM_WINDOW] * UNIFORM_WINDOW
@@ -267,7 +262,7 @@ METRICS = {
     ),
     "ssim1": Metric(
         "uniform 7x7 window, sample covariance, 3 px border dropped, data range 1 (scikit-image)",
-        lambda c: ssim_range1(c.image, c.truth),
+        lambda c: ssim_uniform(c.image, c.truth),
     ),
     "ssim2": Metric(
         "uniform 7x7 window, sample covariance, 3 px border dropped, data range 2 (scikit-image)",

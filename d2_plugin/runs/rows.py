@@ -12,6 +12,7 @@ import math
 import platform
 import shlex
 import subprocess
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -88,19 +89,24 @@ def case_name(recording: str, settings: RunSettings) -> str:
     return ", ".join([*parts, *([settings.protocol] if settings.protocol else [])])
 
 
-def named_by_cameras(rows: Sequence[Row]) -> list[Row]:
-    """The rows, with the cameras behind the case where some of one case trained with other ones: their means are not
-    to be mixed. Rows that do not say their `cameras` stay as they are."""
-    cameras: dict[tuple[str, str], set[str]] = {}
-    for row in rows:
-        if row.get("cameras"):
-            cameras.setdefault((row["kind"], row["case"]), set()).add(" ".join(row["cameras"]))
+def told_apart(rows: Sequence[Row]) -> list[Row]:
+    """The rows, with the cameras behind the case where some of one case trained with other ones, and those that scored
+    and the frames where rows of runs say them: their means are not to be mixed. Others stay as they are."""
+    told = list(rows)
+    for name, front in (("cameras", ""), ("test_cameras", "scored "), ("frames", "frames ")):
+        said = [_listed(row[name]) if name in row and (not front or "test_cameras" in row) else "" for row in told]
+        known = {(row["kind"], row["case"], text) for row, text in zip(told, said) if text}
+        several = Counter(case[:2] for case in known)
+        told = [
+            {**row, "case": f"{row['case']}, {front}{text}"} if text and several[row["kind"], row["case"]] > 1 else row
+            for row, text in zip(told, said)
+        ]
+    return told
 
-    def named(row: Row) -> Row:
-        several = row.get("cameras") and len(cameras[row["kind"], row["case"]]) > 1
-        return {**row, "case": f"{row['case']}, {' '.join(row['cameras'])}"} if several else row
 
-    return [named(row) for row in rows]
+def _listed(names: Sequence[Any] | None) -> str:
+    names = ["all"] if names is None else names
+    return " ".join(map(str, names)) if len(names) < 9 else f"{names[0]} to {names[-1]}, {len(names)} of them"
 
 
 def append_rows(path: Path, rows: Iterable[Row]) -> None:

@@ -17,21 +17,10 @@ from d2_plugin.locks import only_writer
 from d2_plugin.plugin import D2Hooks
 from d2_plugin.priors.summary import PriorSummary
 from d2_plugin.progress import progress_bar
+from d2_plugin.runs import saved
 from d2_plugin.runs.prior.build import build_priors_for, refuse_unusable
 from d2_plugin.runs.prior.trials import LEAST_ITERATIONS, can_decide, tried
 from d2_plugin.runs.rows import circumstances
-from d2_plugin.runs.saved import (
-    METRICS,
-    OnStep,
-    Watch,
-    claim,
-    fitting,
-    load_checkpoint,
-    read_run,
-    save_checkpoint,
-    watched,
-    what_diverged,
-)
 from d2_plugin.runs.scene import Guidance, Scene
 from d2_plugin.runs.settings import HOOK_NAMES, RunSettings, check, hook_config, hooks_in_use
 from d2_plugin.runs.start import TimedPoints, triangulated_points
@@ -66,7 +55,8 @@ class Run:
         self.settings, self.folder, self.guidance = check(settings), folder, guidance
         self._checkpoint = folder / "checkpoint.pt"
         self.scene = Scene.open(self.settings)
-        claim(folder, self.settings.as_table() | ({} if guidance is None else {"guidance": dict(guidance.identity())}))
+        guide = {} if guidance is None else {"guidance": dict(guidance.identity())}
+        saved.claim(folder, self.settings.as_table() | guide)
         self.seconds = {"priors": 0.0, "train": 0.0, "eval": 0.0}
         self.cpu_seconds = dict(self.seconds)
         """The same in CPU time."""
@@ -82,7 +72,7 @@ class Run:
     @checked_arguments
     def load(cls, folder: Path) -> Run:
         """The run that lies in `folder`."""
-        table = read_run(folder)
+        table = saved.read_run(folder)
         if "guidance" in table:
             raise D2Error(f"{folder} is a run of {table['guidance']}: continue it with the command that began it")
         return cls(RunSettings.from_table(table, str(folder / "run.json")), folder)
@@ -123,7 +113,7 @@ class Run:
             return PriorStore.described(self.priors).tried()
         return tried(settings, self.scene, points, self.priors)
 
-    def train(self, on_prior: Callable[[PriorSummary], None] | None = None, watch: Watch | None = None) -> None:
+    def train(self, on_prior: Callable[[PriorSummary], None] | None = None, watch: saved.Watch | None = None) -> None:
         """Build what is missing, then train to the last iteration, continuing from a checkpoint if there is one.
 
         `watch` gets the trainer and returns what is called with step and loss after every step.
@@ -141,14 +131,14 @@ class Run:
             chunk = max(iterations // CHECKPOINTS, 1)
             with progress_bar("train", iterations) as bar:
 
-                def on_step(check: OnStep, step: int, loss: float) -> None:
+                def on_step(check: saved.OnStep, step: int, loss: float) -> None:
                     check(step, loss)
                     bar.update(step, f"loss {loss:.4f}")
                     watching(step, loss)
 
                 while trainer.step < iterations:
                     until = min((trainer.step // chunk + 1) * chunk, iterations)
-                    with self._timed("train"), watched(trainer, self._checkpoint) as check:
+                    with self._timed("train"), saved.watched(trainer, self._checkpoint) as check:
                         trainer.run(until, partial(on_step, check))
                     self._save(trainer)
             self.retired = {} if trainer.d2 is None else dict(trainer.d2.retired)
@@ -166,7 +156,7 @@ class Run:
                 shown = self.folder / "images" if images else None
                 scores = evaluate_scene(trainer.model, self.scene, self.settings.device, shown)
             metrics = scores | _about(self, trainer)
-            write_table(self.folder / "metrics.json", metrics, METRICS)
+            write_table(self.folder / "metrics.json", metrics, saved.METRICS)
         return metrics
 
     @property
@@ -218,13 +208,13 @@ class Run:
     def _save(self, trainer: Any) -> None:
         used: dict[str, Any] = {"seconds": dict(self.seconds), "cpu_seconds": dict(self.cpu_seconds)}
         used |= {"prior": self.prior, "trials": self.trials}
-        save_checkpoint(self._checkpoint, trainer.state_dict() | used)
+        saved.save_checkpoint(self._checkpoint, trainer.state_dict() | used)
 
     def _restore(self, trainer: Any) -> bool:
-        state = load_checkpoint(self._checkpoint, self.settings.device)
+        state = saved.load_checkpoint(self._checkpoint, self.settings.device)
         if state is None:
             return False
-        with fitting(self._checkpoint):
+        with saved.fitting(self._checkpoint):
             self.retired = dict(state["d2"]["retired"]) if state["d2"] else {}
             if trainer.d2 is None:
                 state["d2"] = None
@@ -233,7 +223,7 @@ class Run:
             kept = state["cpu_seconds"]
             self.cpu_seconds = {name: max(value, kept[name]) for name, value in self.cpu_seconds.items()}
             self.prior, self.trials = self.prior or state["prior"], self.trials or state["trials"]
-        wrong = what_diverged(trainer.model)
+        wrong = saved.what_diverged(trainer.model)
         if wrong:
             raise D2Error(f"the model in {self._checkpoint} diverged before step {trainer.step} ({wrong}): train anew")
         return True

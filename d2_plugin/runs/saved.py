@@ -16,18 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from d2_plugin.durable import (
-    Damaged,
-    Kind,
-    OtherFormat,
-    is_leftover,
-    make_folder,
-    opened_archive,
-    read_table,
-    refuse_inside_images,
-    write_archive,
-    write_table,
-)
+from d2_plugin import durable
 from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.trained import trained_tensors
 from d2_plugin.hooks import finite
@@ -36,10 +25,10 @@ from d2_plugin.locks import only_writer
 from d2_plugin.runs.settings import RunSettings
 from d2_plugin.values import shown
 
-RUN = Kind("table of settings", 1, "run `d2 train` with another --output, or remove that folder")
+RUN = durable.Kind("table of settings", 1, "run `d2 train` with another --output, or remove that folder")
 """run.json."""
 
-METRICS = Kind("table of scores", 1, "run `d2 eval` on that folder")
+METRICS = durable.Kind("table of scores", 1, "run `d2 eval` on that folder")
 """metrics.json."""
 
 SHAPE: dict[str, tuple[type, ...]] = {
@@ -63,7 +52,7 @@ def read_run(folder: Path) -> dict[str, Any]:
         D2Error: there is none, it is damaged, or that of another version.
     """
     try:
-        return read_table(folder / "run.json", RUN)
+        return durable.read_table(folder / "run.json", RUN)
     except FileNotFoundError:
         raise D2Error(f"{folder} holds no run: expected run.json; give the --output folder of `d2 train`") from None
 
@@ -76,28 +65,28 @@ def read_metrics(folder: Path) -> dict[str, Any]:
     """
     path = folder / "metrics.json"
     try:
-        table = read_table(path, METRICS)
+        table = durable.read_table(path, METRICS)
     except FileNotFoundError:
         raise D2Error(f"{folder} has no metrics.json: finish `d2 train` there, or run `d2 eval`") from None
     missing = [name for name, kinds in SHAPE.items() if name not in table or not isinstance(table[name], kinds)]
     if missing:
-        raise Damaged(f"the {METRICS.name} {path} is damaged (no {', '.join(missing)} in it): {METRICS.remedy}")
+        raise durable.Damaged(f"the {METRICS.name} {path} is damaged (no {', '.join(missing)} in it): {METRICS.remedy}")
     return table
 
 
 def claim(folder: Path, identity: Mapping[str, Any]) -> None:
     """Take the folder, or find this very run in it; anything else is refused and nothing is written."""
-    refuse_inside_images(folder)
+    durable.refuse_inside_images(folder)
     if (folder / "run.json").exists():
         _refuse_another(folder, identity)
         return
-    if folder.is_dir() and not all(is_leftover(inside) for inside in folder.iterdir()):
+    if folder.is_dir() and not all(durable.is_leftover(inside) for inside in folder.iterdir()):
         raise D2Error(f"{folder} is not empty and holds no run of ours: give another --output")
-    with only_writer(make_folder(folder)):
+    with only_writer(durable.make_folder(folder)):
         if (folder / "run.json").exists():  # somebody was quicker
             _refuse_another(folder, identity)
         else:
-            write_table(folder / "run.json", dict(identity), RUN)
+            durable.write_table(folder / "run.json", dict(identity), RUN)
 
 
 def _refuse_another(folder: Path, identity: Mapping[str, Any]) -> None:
@@ -125,7 +114,7 @@ def save_checkpoint(path: Path, state: Mapping[str, Any]) -> None:
     """Write a state of plain values and tensors; a kill or a full disk leaves the checkpoint before it."""
     content = io.BytesIO()  # torch ends the process where a file that it writes itself cannot be written
     torch.save({**state, "format": CHECKPOINT_FORMAT}, content)
-    write_archive(path, content)
+    durable.write_archive(path, content)
 
 
 def load_checkpoint(path: Path, device: str) -> dict[str, Any] | None:
@@ -136,11 +125,11 @@ def load_checkpoint(path: Path, device: str) -> dict[str, Any] | None:
     """
     if not path.exists():
         return None
-    with opened_archive(path, "checkpoint", _REMEDY) as file, fitting(path):
+    with durable.opened_archive(path, "checkpoint", _REMEDY) as file, fitting(path):
         state = torch.load(file, map_location=device, weights_only=True)
     form = state.get("format") if isinstance(state, dict) else None
     if form != CHECKPOINT_FORMAT:
-        raise OtherFormat(
+        raise durable.OtherFormat(
             f"the checkpoint {path} has format {shown(form)} but this version reads format {CHECKPOINT_FORMAT}: "
             "continue it with the d2-4dgs that wrote it, or remove the file to train from the start"
         )
@@ -156,7 +145,7 @@ def fitting(path: Path) -> Iterator[None]:
         raise
     except MISFITS as error:
         reason = f"{type(error).__name__}: {error}".splitlines()[0]
-        raise Damaged(f"the checkpoint {path} is not one of this run ({reason}): {_REMEDY}") from None
+        raise durable.Damaged(f"the checkpoint {path} is not one of this run ({reason}): {_REMEDY}") from None
 
 
 OnStep = Callable[[int, float], None]

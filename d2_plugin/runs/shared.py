@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from d2_plugin.durable import Kind, make_folder, read_table, write_table
+from d2_plugin.errors import D2Error
 from d2_plugin.priors.summary import PriorSummary
 from d2_plugin.runs.prior.build import build_priors_for
 from d2_plugin.runs.prior.trials import can_decide, tried
@@ -18,7 +19,8 @@ from d2_plugin.runs.settings import HOOK_NAMES, RunSettings, check, prior_settin
 from d2_plugin.runs.start import TimedPoints, triangulated_points
 
 COST = Kind("time that something shared took", 1, "delete it")
-"""NAME.seconds.json, beside what it is about."""
+"""NAME.seconds.json, beside what it is about, with those settings of a run that it depends on."""
+OF = ("train_cameras", "frames", "downscale", "hold_out_instants")
 
 
 @dataclass(frozen=True)
@@ -48,11 +50,13 @@ class Shared:
 
 
 def share_points(settings: RunSettings, folder: Path) -> Path:
-    """Triangulate where `folder` has no points.npz yet; returns its path."""
-    points = folder / "points.npz"
+    """Triangulate where `folder` has no points.npz yet; returns its path. Those of other frames are refused."""
+    points, of = folder / "points.npz", {name: settings.as_table()[name] for name in OF}
     if not _record(points).is_file():
         scene = Scene.open(check(settings))
-        _timed(points, lambda: triangulated_points(scene.recording, scene.train_cameras).save(points))
+        _timed(points, lambda: triangulated_points(scene.recording, scene.train_cameras).save(points), of=of)
+    elif other := [name for name, kept in read_table(_record(points), COST).get("of", of).items() if kept != of[name]]:
+        raise D2Error(f"{folder} holds points and priors for other {', '.join(other)}: give another --output")
     return points
 
 
@@ -87,6 +91,7 @@ def _timed(
     make: Callable[[], Any],
     clock: Callable[[], float] = time.process_time,
     then: Callable[[Any], None] = lambda result: None,
+    **more: Any,
 ) -> None:
     """Make it and do what comes `then`; record beside it what making took, where nothing of it was there before."""
     make_folder(made.parent)
@@ -94,4 +99,4 @@ def _timed(
     result = make()
     seconds = clock() - start
     then(result)
-    write_table(_record(made), {"seconds": seconds if whole else None}, COST)
+    write_table(_record(made), {"seconds": seconds if whole else None, **more}, COST)

@@ -68,15 +68,15 @@ class ViewedRun:
         """Seconds from the first frame to the last."""
         return self.recording.seconds(self.recording.frames[-1])
 
-    def frame_at(self, time: float) -> int:
-        """The recorded frame that is nearest to an instant, in seconds."""
-        return min(self.recording.frames, key=lambda frame: abs(self.recording.seconds(frame) - time))
+    def frame_at(self, time: float, camera: str | None = None) -> int:
+        """The recorded frame, as `camera` took it, that is nearest to an instant, in seconds."""
+        return min(self.recording.frames, key=lambda frame: abs(self.recording.seconds(frame, camera) - time))
 
     def view(self, camera: Camera, time: float, size: tuple[int, int] | None = None) -> View:
         """What a camera sees at an instant, in its own size or another; it has a name if it is one of the recording."""
         camera = camera if size is None else for_size(camera, *size)
         T, K = (torch.tensor(m, dtype=torch.float32, device=self.device) for m in (camera.T_camera_world, camera.K))
-        moment = self.frame_at(time), self.time_offset + time * self.time_scale
+        moment = self.frame_at(time, camera.name), self.time_offset + time * self.time_scale
         return View(camera.name, *moment, T, K, camera.width, camera.height)
 
     @property

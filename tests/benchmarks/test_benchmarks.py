@@ -56,9 +56,7 @@ def test_parts_are_found_from_any_folder_and_a_mistake_is_one_sentence(tmp_path:
         ("stability --sweeps epsilon", 16, "| epsilon | float32 | smoothing over median depth: 1e-08 .. 0.1 | 8 | 8 |"),
     ],
 )
-def test_a_part_adds_rows_of_what_it_measured_and_prints_their_tables(
-    words, rows, shown, tmp_path, capsys, monkeypatch
-) -> None:
+def test_a_part_adds_rows_and_prints_their_tables(words, rows, shown, tmp_path, capsys, monkeypatch) -> None:
     monkeypatch.setattr("torch.set_num_threads", lambda count: None)
     monkeypatch.setattr(scaling, "in_fresh_process", lambda work, *given: memory.Measured(work(*given), 1.0))
     assert main([*words.split(), "--output", str(tmp_path / "rows.jsonl")]) == 0

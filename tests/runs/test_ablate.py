@@ -72,6 +72,13 @@ class TestTables:
         [cells] = order_table(rows_of(full=full, backbone=backbone)).rows
         assert cells[:2] == ("Backbone", verdict)
 
+    def test_a_run_that_failed_is_no_seed_and_says_why(self) -> None:
+        rows = rows_of(backbone=[20.0, 21.0, 22.0])["backbone"]
+        rows[0] |= {"scores": None, "gaussians": None, "setting": "8 steps, seed 0", "failed": "it diverged"}
+        text = report(rows, rows_named(["backbone"]))
+        assert "| Backbone | two seeds | 21.50 ± 0.50 |" in text
+        assert "yang4d backbone, 8 steps, seed 0 has no score: it diverged." in text
+
     def test_the_papers_own_figures_stand_beside_labelled(self) -> None:
         rows = rows_of(**{name: [28.0] for name in TABLES["pruning"]})
         text = report([row for mine in rows.values() for row in mine], rows_named(["pruning"]))
@@ -102,3 +109,4 @@ def test_the_command_trains_shares_priors_and_repeats_nothing(saved_room, tmp_pa
         assert main(command) == 0
     assert {path: path.stat().st_mtime_ns for path in checkpoints} == checkpoints
     assert "another run" in refused(*command, "--iterations", "9")
+    assert "for other frames: give another --output" in refused(*command, "--rows", "no_rgbd", "--frames", "0")

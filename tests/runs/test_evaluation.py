@@ -19,7 +19,7 @@ from d2_plugin.recordings.recording import Recording
 from d2_plugin.recordings.selection import select_cameras
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.runs import drawing, metrics
-from d2_plugin.runs.evaluation import RenderView, evaluate
+from d2_plugin.runs.evaluation import RenderView, evaluate, evaluate_scene
 from d2_plugin.runs.scene import Scene
 from d2_plugin.runs.settings import RunSettings
 
@@ -108,6 +108,13 @@ def test_both_lpips_networks_are_kept_apart(recording: Recording) -> None:
     nets = {name: Mock(return_value=value, variant=variant) for name, (value, variant) in found.items()}
     result = evaluate(renderer(recording), recording, ["test0"], [0], **nets)
     assert {name: (result["test"][name], result["variants"][name]) for name in nets} == found
+
+
+def test_images_too_small_for_lpips_are_scored_without_it(recording: Recording, monkeypatch) -> None:
+    monkeypatch.setattr("d2_plugin.runs.evaluation.find_lpips", lambda net: Mock(side_effect=D2Error("too small")))
+    black = Mock(render=lambda view: (torch.zeros(40, 72, 3), torch.zeros(40, 72), torch.zeros(40, 72)))
+    scores = evaluate_scene(black, Mock(scored=recording, test_cameras=NAMES, between=()), "cpu")["test"]
+    assert scores["lpips"] is scores["lpips_vgg"] is None
 
 
 @pytest.mark.parametrize("missing", [0.0, np.nan, np.inf, -1.0])

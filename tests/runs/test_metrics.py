@@ -39,7 +39,7 @@ def test_ssim1_and_ssim2_are_scikit_images(height: int, width: int, noise: float
     generator = torch.Generator().manual_seed(seed)
     a = torch.rand(height, width, 3, generator=generator)
     b = (a + noise * torch.randn(a.shape, generator=generator)).clamp(0, 1)
-    assert metrics.ssim_range1(a, b) == pytest.approx(scikit_image(a, b, 1.0), abs=1e-9)
+    assert metrics.ssim_uniform(a, b) == pytest.approx(scikit_image(a, b, 1.0), abs=1e-9)
     assert metrics.ssim_uniform(a, b, 2.0) == pytest.approx(scikit_image(a, b, 2.0), abs=1e-9)
 
 
@@ -60,7 +60,7 @@ def test_the_gaussian_ssim_is_the_convolution_of_3dgs() -> None:
     assert ssim(*(image.double() for image in sine_pair())).item() == pytest.approx(expected, abs=1e-12)
 
 
-@pytest.mark.parametrize(("metric", "size"), [(metrics.ssim_range1, 7), (metrics.ssim_3dgs, 11)])
+@pytest.mark.parametrize(("metric", "size"), [(metrics.ssim_uniform, 7), (metrics.ssim_3dgs, 11)])
 def test_a_window_larger_than_the_image_is_refused(metric: Callable[..., float], size: int) -> None:
     assert math.isfinite(metric(torch.rand(size, size, 3), torch.rand(size, size, 3)))
     small = torch.rand(size - 1, 40, 3)

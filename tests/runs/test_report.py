@@ -19,7 +19,7 @@ from d2_plugin.runs.report.quality import groups_of, scores_table
 from d2_plugin.runs.report.report import BUILDERS, ReportSettings, collect, make_report, run
 from d2_plugin.runs.report.run_folders import training_row
 from d2_plugin.runs.report.svg import Axis
-from d2_plugin.runs.rows import Row, append_rows, make_row, named_by_cameras, read_rows
+from d2_plugin.runs.rows import Row, append_rows, make_row, read_rows, told_apart
 from d2_plugin.runs.saved import METRICS, RUN
 from d2_plugin.runs.settings import RunSettings
 from d2_plugin.runs.tables import Table, markdown
@@ -104,11 +104,19 @@ def test_plots_are_well_formed_and_the_page_needs_nothing_from_outside(report: P
 
 class TestGroups:
     def test_names_say_what_ran_and_d2_stands_first_of_each_length(self) -> None:
-        names = ("yang4d pearson", "yang4d backbone", "yang4d full", "yang4d mvs_only", "deform full", "yang4d full, x")
+        names = [f"yang4d{rest}" for rest in (" pearson", "", " full", " mvs_only", " full, x", ", x")] + [
+            "deform full"
+        ]
         rows = [scored(name, 0, target, psnr=20.0) for target in ("30 s", "10 s") for name in names]
         groups = groups_of([*rows, scored("yang4d full", 0, "try", psnr=1.0)])
-        order = ["D²", "D² (deform)", "D², x", "stereo alone", "backbone alone", "pearson"]
+        order = ["D²", "D² (deform)", "D², x", "stereo alone", "backbone alone", "backbone alone, x", "pearson"]
         assert [(group.length, group.method) for group in groups] == [(n, m) for n in ("10 s", "30 s") for m in order]
+
+    def test_d2_is_compared_with_methods_of_its_own_backbone_alone(self, tmp_path: Path) -> None:
+        names = ("yang4d full", "yang4d mvs_only", "yang4d backbone", "deform full", "deform full, x", "other backbone")
+        text = make_report([scored(name, 0, psnr=20.0) for name in names], tmp_path)[1].read_text()
+        lines = [line.strip("| ").split(" | ") for line in text.splitlines() if "no verdict" in line]
+        assert [line[1] for line in lines] == ["stereo alone", "backbone alone", "D² (deform), x", "D² (deform)"]
 
     def test_a_repeated_seed_is_no_further_one(self) -> None:
         row = scored("yang4d full", 0, psnr=28.0)
@@ -171,15 +179,18 @@ def test_a_line_that_is_no_row_is_named(tmp_path: Path, line: str, message: str)
     refuses("cannot read .*there is no such file", read_rows, [tmp_path / "absent.jsonl"])
 
 
-def test_other_cameras_of_one_recording_are_another_case() -> None:
+def test_other_cameras_or_frames_of_one_recording_are_another_case() -> None:
     def row(cameras: list[str] | None, kind: str = "quality") -> dict:
         more = {} if cameras is None else {"cameras": cameras}
         return {"kind": kind, "case": "plaza, 2 views", **more}
 
-    pairs = named_by_cameras([row(["00", "07"]), row(["01", "03"]), row(None), row(["01", "03"], "training")])
+    pairs = told_apart([row(["00", "07"]), row(["01", "03"]), row(None), row(["01", "03"], "training")])
     names = ["plaza, 2 views, 00 07", "plaza, 2 views, 01 03", "plaza, 2 views", "plaza, 2 views"]
     assert [each["case"] for each in pairs] == names
-    assert [each["case"] for each in named_by_cameras([row(["00", "07"]), row(["00", "07"])])] == ["plaza, 2 views"] * 2
+    assert [each["case"] for each in told_apart([row(["00", "07"]), row(["00", "07"])])] == ["plaza, 2 views"] * 2
+    frames = [row(["00"]) | {"test_cameras": ["01"], "frames": frames} for frames in (None, [0, 2], list(range(20)))]
+    ends = ["all", "0 2", "0 to 19, 20 of them"]
+    assert [each["case"] for each in told_apart(frames)] == [f"plaza, 2 views, frames {end}" for end in ends]
 
 
 def test_a_run_folder_becomes_a_row_with_the_priors_time_beside(tmp_path: Path) -> None:

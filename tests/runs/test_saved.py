@@ -184,11 +184,9 @@ class TestThePriorOfARun:
         assert read_metrics(tmp_path / "run")["prior"] == prior
 
 
-def test_the_checkpoint_before_is_there_when_the_next_cannot_be_written_and_a_run_goes_on_from_it(
-    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_goes_on_from_the_checkpoint_before_one_that_cannot_be_written(scene, tmp_path, monkeypatch) -> None:
     run = bare(scene, tmp_path / "run", iterations=6)
-    save, saved = run_module.save_checkpoint, []
+    save, saved = run_module.saved.save_checkpoint, []
 
     def full(path: Path, state: Any) -> None:
         if len(saved) == 3:
@@ -197,11 +195,11 @@ def test_the_checkpoint_before_is_there_when_the_next_cannot_be_written_and_a_ru
         save(path, state)
 
     with monkeypatch.context() as patch:
-        patch.setattr(run_module, "save_checkpoint", full)
+        patch.setattr(run_module.saved, "save_checkpoint", full)
         refuses("cannot write", run.train)
     assert load_checkpoint(run.folder / "checkpoint.pt", "cpu")["step"] == 3
     saved.clear()
-    monkeypatch.setattr(run_module, "save_checkpoint", lambda path, state: saved.append(state["step"]))
+    monkeypatch.setattr(run_module.saved, "save_checkpoint", lambda path, state: saved.append(state["step"]))
     bare(scene, tmp_path / "run", iterations=6).train()
     assert saved == [4, 5, 6], "it goes on from there"
 

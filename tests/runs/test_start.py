@@ -66,8 +66,7 @@ def test_too_few_points_are_filled_up_inside_the_views(recording) -> None:
     positions, _, _ = start.tensors()
     assert positions.shape == (400, 3)
     assert torch.equal(positions[:50], torch.tensor(points, dtype=torch.float32))
-    assert (start.colors >= 0).all()
-    assert (start.colors <= 1).all()
+    assert ((start.colors >= 0) & (start.colors <= 1)).all()
     assert (start.times <= 0.2).all()
     for name, rows in (("train0", slice(50, 225)), ("train1", slice(225, 400))):
         _, depths, inside = projected(recording.cameras[name], start.positions[rows])

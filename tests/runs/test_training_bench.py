@@ -19,17 +19,7 @@ from d2_plugin.runs.ablation.presets import PRESETS
 from d2_plugin.runs.rows import TRY, Row, make_row
 from d2_plugin.runs.settings import RunSettings
 from d2_plugin.runs.shared import Shared
-from d2_plugin.runs.training.bench import (
-    TOLERANCE,
-    Case,
-    Method,
-    TrainingBench,
-    case_of,
-    fits,
-    line_of,
-    nearest,
-    next_steps,
-)
+from d2_plugin.runs.training import bench as timed
 from d2_plugin.runs.training.measured import Work, fingerprint, follow
 
 SETTINGS = RunSettings("room", ("a", "b"))
@@ -40,53 +30,45 @@ class TestBudget:
     def test_a_power_law_is_met_within_three_tries(self, law: float, cost: float, target: float) -> None:
         tried: list[tuple[int, float]] = []
         for _ in range(4):
-            steps = next_steps(target, tried)
+            steps = timed.next_steps(target, tried)
             tried.append((steps, cost * steps**law))
-            if fits(target, tried[-1]):
+            if timed.fits(target, tried[-1]):
                 break
-        steps = nearest(target, tried)
+        steps = timed.nearest(target, tried)
         rounding = 1.5 / steps  # few steps cannot meet a time exactly
-        assert abs(cost * steps**law / target - 1) <= TOLERANCE + law * rounding
+        assert abs(cost * steps**law / target - 1) <= timed.TOLERANCE + law * rounding
 
     def test_noise_between_two_near_lengths_does_not_turn_the_law_around(self) -> None:
-        assert 100 < next_steps(20, [(100, 10.0), (101, 9.0)]) < 300
+        assert 100 < timed.next_steps(20, [(100, 10.0), (101, 9.0)]) < 300
 
 
 class TestCases:
     def test_cameras_stand_behind_the_path(self) -> None:
-        case = case_of("data/studio@00+02@01+03", replace(SETTINGS, downscale=2))
+        case = timed.case_of("data/studio@00+02@01+03", replace(SETTINGS, downscale=2))
         assert case.name == "studio, 2 views, 1/2 size"
         assert case.settings.train_cameras == ("00", "02")
         assert case.settings.test_cameras == ("01", "03")
-        assert case_of("studio@00", SETTINGS).settings.test_cameras is None
+        assert timed.case_of("studio@00", SETTINGS).settings.test_cameras is None
 
     @pytest.mark.parametrize("text", ["studio", "@00", "a@b@c@d", ""])
     def test_a_recording_without_cameras_is_refused_with_an_example(self, text: str) -> None:
-        refuses("PATH@00", case_of, text, SETTINGS)
+        refuses("PATH@00", timed.case_of, text, SETTINGS)
 
 
 def now(work: Work) -> Future[Row]:
     """A row as if each step of the run had taken a twentieth of a second."""
     settings, future = work.settings, Future()
-    row = make_row(
-        *("quality", work.case, work.method),
-        error=0.1,
-        seconds=settings.iterations / 20,
-        fingerprint=fingerprint(work),
-        cameras=list(settings.train_cameras),
-        target=work.target,
-        iterations=settings.iterations,
-        seed=settings.seed,
-    )
-    future.set_result(row)
+    about = {"fingerprint": fingerprint(work), "cameras": list(settings.train_cameras), "target": work.target}
+    about |= {"seconds": settings.iterations / 20, "iterations": settings.iterations, "seed": settings.seed}
+    future.set_result(make_row("quality", work.case, work.method, error=0.1, **about))
     return future
 
 
 def bench(known: Sequence[Row], methods: Sequence[str] = ("backbone", "full"), **more: Any) -> list[Row]:
     """The rows that one call writes, given what lies there already."""
-    settings = TrainingBench(("room@a+b",), **more)
-    case, shared = Case("room, 2 views", "room", SETTINGS), Shared(Path("/out/room"), "dual")
-    lines = [line_of(Method(settings, case, shared, PRESETS[name], "d2"), known) for name in methods]
+    settings = timed.TrainingBench(("room@a+b",), **more)
+    case, shared = timed.Case("room, 2 views", "room", SETTINGS), Shared(Path("/out/room"), "dual")
+    lines = [timed.line_of(timed.Method(settings, case, shared, PRESETS[name], "d2"), known) for name in methods]
     rows: list[Row] = []
     follow(lines, now, rows.append)
     return rows
@@ -99,7 +81,7 @@ class TestPlan:
             mine = [row for row in rows if row["target"] == f"{budget} s"]
             assert sorted(row["seed"] for row in mine) == [0, 1, 2]
             assert len({row["iterations"] for row in mine}) == 1
-            assert mine[0]["seconds"] == pytest.approx(budget, rel=TOLERANCE)
+            assert mine[0]["seconds"] == pytest.approx(budget, rel=timed.TOLERANCE)
         assert {row["seed"] for row in rows if row["target"] == TRY} == {0}
 
     def test_a_rerun_does_nothing_and_a_wider_one_only_what_is_missing(self) -> None:

@@ -69,7 +69,7 @@ def test_ssim_at_left_out_cameras_decides_and_one_line_says_so() -> None:
     ("behind", "declared", "choice"),
     [(0.003, 0.05, "all"), (0.006, 0.05, "stereo"), (0.003, 0.08, "stereo"), (0.003, math.nan, "stereo")],
 )
-def test_where_images_are_as_good_a_network_that_declares_small_errors_adds_its_surfaces(
+def test_where_images_are_as_good_small_declared_errors_add_surfaces(
     behind: float, declared: float, choice: str
 ) -> None:
     tie = Trials({"a": GOOD - behind}, {"a": GOOD}, declared, 1.0)
@@ -103,7 +103,7 @@ def stored(folder: Path, recording: Recording, wrong: float) -> Path:
 
 
 @pytest.mark.parametrize(("wrong", "choice"), [(0.0, "all"), (0.5, "stereo")])
-def test_depth_that_is_right_is_believed_and_depth_that_is_not_is_not_whatever_its_sigma(
+def test_depth_is_believed_if_it_is_right_whatever_its_sigma(
     room: Path, tmp_path: Path, wrong: float, choice: str
 ) -> None:
     settings = RunSettings(str(room), TRAINED)
@@ -171,7 +171,7 @@ def test_the_user_may_choose_and_then_nothing_is_tried(settings, tmp_path, tried
         ("all", {"priors": {"variant": "mvs"}}, True),
     ],
 )
-def test_parallax_is_left_out_where_another_depth_fills_what_stereo_leaves_empty(
+def test_parallax_is_left_out_where_other_depth_fills_the_gaps(
     settings, tmp_path, monkeypatch, choice, tables, on
 ) -> None:
     run = run_of(replace(settings, overrides=tables), tmp_path / "run")
@@ -188,9 +188,7 @@ def test_one_of_two_cameras_would_train_alone_so_two_cameras_get_no_trial(room: 
     assert not can_decide(replace(run.scene, train_cameras=TRAINED[:2]))
 
 
-def test_what_one_run_tried_serves_every_trainer_with_that_prior_until_the_prior_changes(
-    settings: RunSettings, tmp_path: Path, tried: list[RunSettings]
-) -> None:
+def test_what_one_run_tried_serves_every_trainer_until_the_prior_changes(settings, tmp_path: Path, tried: list) -> None:
     first = replace(settings, seed=3, backbone="deform")
     for number, run_settings in enumerate((first, replace(first, iterations=3))):
         run = run_of(run_settings, tmp_path / str(number))

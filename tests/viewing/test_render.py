@@ -3,6 +3,7 @@
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 
@@ -90,6 +91,9 @@ def test_time_plays_bounces_slows_and_freezes(viewed: ViewedRun) -> None:
     nearest = times(speed=0.5, show=("truth",))
     assert {*nearest} == {0, 1, 2, 3}
     assert max(abs(time - 0.5 * i) for i, time in enumerate(nearest)) <= 0.5
+    late = replace(viewed.recording, late={"test0": {1: 0.02, 3: 0.05}})
+    shown = plan_video(replace(viewed, recording=late), RenderSettings((), show=("truth",))).stops
+    assert [stop.time for stop in shown] == pytest.approx([late.seconds(frame, "test0") for frame in late.frames])
     assert len(times(path="training")) == 3 * 4
     refuses("lies outside the recording, which lasts 0.25 s", plan_video, viewed, RenderSettings((), at=3.0))
 
@@ -145,9 +149,7 @@ def test_what_cannot_be_shown_is_one_sentence(trained: Path, room: Path, tmp_pat
 
 
 @pytest.mark.parametrize("command", ["render", "view", "export"])
-def test_a_run_of_which_nothing_is_left_or_known_is_one_sentence(
-    trained: Path, tmp_path, refused, command: str
-) -> None:
+def test_a_run_of_which_nothing_is_left_or_known_is_one_sentence(trained, tmp_path, refused, command) -> None:
     folder = shutil.copytree(trained, tmp_path / "run")
     state = torch.load(folder / "checkpoint.pt", weights_only=True)
     parts = {name: {key: row[:0] for key, row in state["model"][name].items()} for name in ("parameters", "statistics")}
@@ -189,8 +191,7 @@ def test_every_image_comes_back_at_its_rate_odd_sides_gain_one_and_the_index_is_
     write(path, images, 29.97)
     with av.open(str(path)) as container:
         stream = container.streams.video[0]
-        assert stream.codec_context.name == "h264"
-        assert stream.codec_context.pix_fmt == "yuv420p"
+        assert (stream.codec_context.name, stream.codec_context.pix_fmt) == ("h264", "yuv420p")
         assert (stream.width, stream.height) == (64, 48)
         assert (stream.average_rate, stream.frames) == (Fraction(30000, 1001), 9)
         assert stream.duration * stream.time_base == Fraction(9 * 1001, 30000)

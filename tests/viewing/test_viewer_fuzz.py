@@ -76,9 +76,8 @@ def test_only_what_the_page_sends_comes_in(viewed: ViewedRun, monkeypatch: pytes
         control = page.controls["recorded"]
         update = {"type": "GuiUpdateMessage", "uuid": control._impl.uuid}
         socket.send(msgpack.encode({"type": "ShareUrlRequest"}))
-        socket.send(msgpack.encode({**update, "updates": {"max": 5.0, "value": 0.2}}))
-        socket.send(msgpack.encode({**update, "updates": {"update_cb": [1]}}))
-        socket.send(msgpack.encode({**update, "updates": {"value": 0.5}}))
+        for changed in ({"max": 5.0, "value": 0.2}, {"update_cb": [1]}, {"value": 0.5}):
+            socket.send(msgpack.encode({**update, "updates": changed}))
         viewer.stay(lambda: control.value == 0.5)
         assert control.max == 1.0
         assert not shared, "a page is not brought to the internet because a client asks for it"
@@ -121,13 +120,11 @@ def test_keyframes_come_and_go_while_the_path_is_asked_for(viewed: ViewedRun, ca
     with showing(viewed) as viewer, connected(viewer) as socket:
         drawn(viewer, 1)
         [(page, _)] = viewer._pages.values()
-        buttons = {
-            control.label: {"type": "GuiUpdateMessage", "uuid": uuid, "updates": {"value": True}}
-            for uuid, control in page.client.gui._gui_input_handle_from_uuid.items()
-        }
+        buttons = {control.label: uuid for uuid, control in page.client.gui._gui_input_handle_from_uuid.items()}
+        press = {"type": "GuiUpdateMessage", "updates": {"value": True}}
         clicks = ["Add keyframe"] * 5 + ["Save camera_path.json", "Preview", "Remove the last", "Add keyframe"] * 5
         for label in clicks:
-            socket.send(msgpack.encode(buttons[label]))
+            socket.send(msgpack.encode(press | {"uuid": buttons[label]}))
         viewer.stay(lambda: len(page.keyframes) == 5 and page._previewed is not None)
     said = capfd.readouterr()
     assert "Traceback" not in said.err + said.out, said

@@ -101,6 +101,7 @@ def report(rows: Sequence[Row], presets: Sequence[Preset]) -> str:
         order = order_table(mine)
         if order.rows:
             parts += [EXPLANATION, markdown(order)]
+    parts += [f"{row['method']}, {row['setting']} has no score: {row['failed']}." for row in rows if row.get("failed")]
     return "\n\n".join(parts) + "\n"
 
 
@@ -117,7 +118,8 @@ def table(runs: Mapping[str, Sequence[Row]], published: Mapping[str, float] | No
     for name, mine in runs.items():
         shown = [([score.get(column.key) for score in scores[name]], column.form) for column in columns]
         shown += [([row.get("gaussians") for row in mine], ".0f"), ([row["seconds"] for row in mine], ".1f")]
-        lines.append([_title(name), seeds_in_words(len(mine)), *(estimated(*values) for values in shown)])
+        seeds = seeds_in_words(sum(bool(score) for score in scores[name]))
+        lines.append([_title(name), seeds, *(estimated(*values) for values in shown)])
         if published:
             lines[-1].append(f"{published[name]:.2f}" if name in published else "-")
     header += [f"{MARK} paper's PSNR"] if published else []

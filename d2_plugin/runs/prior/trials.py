@@ -32,7 +32,7 @@ from d2_plugin.plugin import D2Hooks
 from d2_plugin.progress import progress_bar
 from d2_plugin.protocol import DepthPrior, Label
 from d2_plugin.recordings import open_recording
-from d2_plugin.runs.metrics import ssim_range1
+from d2_plugin.runs.metrics import ssim_uniform
 from d2_plugin.runs.scene import Scene
 from d2_plugin.runs.settings import HOOK_NAMES, RunSettings, hook_config
 from d2_plugin.runs.start import TimedPoints, make_view
@@ -199,7 +199,7 @@ class _Trial:
             truth = torch.from_numpy(self.scene.recording.image(camera, frame)).float() / 255
             view = make_view(self.scene.recording, camera, frame, self.settings.device)
             predicted = model.render(view).color.cpu().clamp(0, 1)
-            scores.append(ssim_range1(predicted, truth))
+            scores.append(ssim_uniform(predicted, truth))
         return float(np.mean(scores))
 
 

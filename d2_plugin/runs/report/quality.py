@@ -89,7 +89,7 @@ def groups_of(rows: Sequence[Row]) -> list[Group]:
     Tries are left out, and a run that was repeated with its seed counts once.
     """
     scored = [row for row in rows if (row.get("scores") or {}).get("psnr") is not None and row.get("target") != TRY]
-    backbones = [row["method"].partition(" ")[0] for row in scored]
+    backbones = list(map(_backbone, scored))
     usual = max(backbones, key=backbones.count, default="")
     runs: dict[tuple[str, str, str], list[Row]] = {}
     for row in scored:
@@ -119,10 +119,14 @@ def _rank(method: str) -> tuple[int, str]:
     return next((place for place, name in enumerate(known) if method.startswith(name)), len(known)), method
 
 
+def _backbone(row: Row) -> str:
+    return row["method"].partition(",")[0].partition(" ")[0]
+
+
 def _method(text: str, usual: str) -> str:
     """`yang4d full, label` as `D², label`, with the backbone's name behind it where that is not the usual one."""
-    backbone, _, rest = text.partition(" ")
-    preset, comma, label = rest.partition(", ")
+    named, comma, label = text.partition(", ")
+    backbone, _, preset = named.partition(" ")
     other = "" if backbone == usual else f" ({backbone})"
     return NAMES.get(preset, preset.removeprefix("+ ")) + other + comma + label
 
@@ -131,7 +135,7 @@ def _figure(groups: Sequence[Group], time: str) -> str:
     """PSNR over minutes, a plot for each recording; a method has one colour in all of them, and a line from length to
     length. Lengths in seconds alone where there are any, since times of two campaigns do not compare, the usual
     backbone alone, and where there are such, recordings of which all instants train."""
-    groups = [group for group in groups if not group.method.endswith(")")]
+    groups = [group for group in groups if f" ({_backbone(group.rows[0])})" not in group.method]
     groups = [group for group in groups if "of the instants" not in group.case] or groups
     methods = sorted({group.method for group in groups}, key=_rank)
     plots = []
@@ -187,9 +191,10 @@ def _order(groups: Sequence[Group]) -> Table:
     titles = ["recording, at", f"{D2} against", *(column.title for column in STUDY_COLUMNS)]
     lines: list[Mapping[str, str]] = []
     for key in dict.fromkeys((group.case, group.length) for group in groups):
-        scores = {g.method: [row["scores"] for row in g.rows] for g in groups if (g.case, g.length) == key}
+        mine = {g.method: g.rows for g in groups if (g.case, g.length) == key}
+        scores = {name: [row["scores"] for row in rows] for name, rows in mine.items()}
         for ours in (name for name in scores if name.startswith(D2)):
-            others = [name for name in scores if name != ours and name.endswith(")") == ours.endswith(")")]
+            others = [n for n, rows in mine.items() if n != ours and _backbone(rows[0]) == _backbone(mine[ours][0])]
             made = verdicts_table(scores, ours, others, titles[1])
             lines += [{titles[0]: ", ".join(key), **dict(zip(made.header, cells))} for cells in made.rows]
     header = [title for title in titles if any(line.get(title, "-") != "-" for line in lines)]

@@ -15,7 +15,7 @@ from d2_plugin.reading import parsing
 from d2_plugin.runs.report.page import TITLE, Image, Section, html, markdown
 from d2_plugin.runs.report.quality import QUALITY, section
 from d2_plugin.runs.report.run_folders import image_of, method_of, training_row
-from d2_plugin.runs.rows import Row, named_by_cameras, read_rows
+from d2_plugin.runs.rows import Row, read_rows, told_apart
 from d2_plugin.runs.saved import read_metrics
 from d2_plugin.settings import Positional, Settings
 
@@ -46,8 +46,7 @@ class ReportSettings(Settings):
 def run(settings: ReportSettings, builders: Mapping[str, Builder] = BUILDERS) -> str:
     """Make the report; how many rows it holds, and which files it is."""
     rows, images = collect(settings.sources)
-    images = [] if settings.no_images else images
-    page, markdown_file, *plots = make_report(rows, settings.output, images, builders)
+    page, markdown_file, *plots = make_report(rows, settings.output, [] if settings.no_images else images, builders)
     return f"{len(rows)} rows; open {page}, or read {markdown_file} with its {len(plots)} plots"
 
 
@@ -65,7 +64,7 @@ def make_report(
     """
     if not rows:
         raise D2Error("there is nothing to report: give a runs.jsonl with rows in it, or the folder of a finished run")
-    rows = named_by_cameras(rows)
+    rows = told_apart(rows)
     for row in rows:
         if row["kind"] not in builders:
             raise D2Error(

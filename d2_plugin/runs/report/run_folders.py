@@ -13,6 +13,7 @@ from d2_plugin.recordings.images import encode_jpeg, read_image, shrink_image
 from d2_plugin.runs.rows import Row, case_name, command_line, make_row, rms_error
 from d2_plugin.runs.saved import read_metrics, read_run
 from d2_plugin.runs.settings import HOOK_NAMES, RunSettings
+from d2_plugin.store.files import hash_of
 
 IMAGE_WIDTH = 1600
 """Images in the report are made at most this wide by averaging whole blocks, pixels."""
@@ -32,11 +33,14 @@ def training_row(folder: Path) -> Row:
     settings = RunSettings.from_table(table, str(folder / "run.json"))
     scores, seconds = metrics["test"] or {}, metrics["seconds"]
     typed = replace(settings, hooks=settings.hooks or ("none",), overrides={}, protocol=None)
-    command = command_line("d2 train", typed) + (" --config TABLES" if settings.overrides else "")
+    own = [Path(given).name for given in (settings.mono_onnx, settings.multiview) if given and settings.hooks]
+    own += [f"background {settings.background_weight:g}"] if settings.background_weight < 1 else []
+    tables = f"TABLES-{hash_of(settings.overrides)[:4]}" if settings.overrides else ""
+    command = command_line("d2 train", typed) + (f" --config {tables}" if tables else "")
     row = make_row(
         "training",
         case_name(metrics["recording"], settings),
-        method_of(metrics) + (", own settings" if settings.overrides else ""),
+        ", ".join([method_of(metrics), *own, *([f"own settings {tables[-4:]}"] if tables else [])]),
         f"{metrics['iterations']} steps, seed {settings.seed}",
         error=rms_error(scores),
         seconds=seconds["train"],

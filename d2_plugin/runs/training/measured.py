@@ -93,7 +93,8 @@ def _row(work: Work, metrics: Mapping[str, Any] | None, failed: str | None = Non
     """A run as a row; trials that decided what of the prior is used count as time of the prior."""
     settings, error, measured = work.settings, None, dict[str, Any]()
     about: dict[str, Any] = {"target": work.target, "iterations": settings.iterations, "seed": settings.seed}
-    about |= {"cameras": list(settings.train_cameras), **work.about, "fingerprint": fingerprint(work)}
+    about |= {"cameras": list(settings.train_cameras), "test_cameras": settings.test_cameras, "frames": settings.frames}
+    about |= {**work.about, "fingerprint": fingerprint(work)}
     if metrics is not None:
         scores = metrics["test"] or {}
         error = rms_error(scores)

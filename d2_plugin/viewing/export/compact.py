@@ -65,8 +65,7 @@ def compacted(viewed: ViewedRun, keep: float) -> ViewedRun:
     scores = _scores(viewed, viewed.test_cameras) if viewed.scores else {}
     if scores:
         note += f"; {scores['']:.2f} dB held out, {viewed.scores['']:.2f} with all"
-    notes = [viewed.note, note] if viewed.note else [note]
-    return replace(viewed, inserted_at=None, scores=scores, note="\n".join(notes))
+    return replace(viewed, inserted_at=None, scores=scores, note="\n".join(filter(None, [viewed.note, note])))
 
 
 def _color(backbone: Any, view: View, opacities: Tensor | None = None) -> Tensor:

@@ -81,9 +81,9 @@ def draw(page: Page, wanted: Wanted, marked: Tensor | None, seconds: float | Non
     known = wanted.marked and marked is not None and len(marked) == len(viewed.backbone)
     view, compared = viewed.view(wanted.camera(*size), wanted.time), wanted.recorded > 0 or wanted.show == "error"
     if wanted.standing is not None and compared:
-        camera, frame = viewed.recording.cameras[wanted.standing], viewed.frame_at(wanted.time)
+        camera, frame = viewed.recording.cameras[wanted.standing], viewed.frame_at(wanted.time, wanted.standing)
         shape = max(round(size[1] * camera.width / camera.height), 1), size[1]
-        view = viewed.view(camera, viewed.recording.seconds(frame), shape)
+        view = viewed.view(camera, viewed.recording.seconds(frame, camera.name), shape)
     shot = Shot(viewed, view, None, marked if known else None)
     image = KINDS[wanted.show](shot).image
     if wanted.recorded > 0:

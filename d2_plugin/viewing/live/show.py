@@ -139,7 +139,7 @@ def _scores(viewed: ViewedRun) -> Iterator[str | None]:
             if share.due:
                 break
             yield None
-        shot = Shot(viewed, viewed.view(recording.cameras[name], recording.seconds(frame)))
+        shot = Shot(viewed, viewed.view(recording.cameras[name], recording.seconds(frame, name)))
         scores.append(psnr(shot.rendered.color, torch.from_numpy(shot.truth).float() / 255))
         share.spent += time.monotonic() - now
         yield f"{sum(scores) / len(scores):.2f} dB PSNR, {kind}, last {len(scores)} views"

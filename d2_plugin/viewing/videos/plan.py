@@ -108,7 +108,8 @@ def plan_video(viewed: ViewedRun, settings: RenderSettings) -> Plan:
     else:
         stops, fps = _from_file(viewed, settings)
     if settings.recorded:
-        stops = [stop._replace(time=viewed.recording.seconds(viewed.frame_at(stop.time))) for stop in stops]
+        seconds, at = viewed.recording.seconds, viewed.frame_at
+        stops = [Stop(camera, seconds(at(time, camera.name), camera.name)) for camera, time in stops]
     return Plan(stops, fps)
 
 

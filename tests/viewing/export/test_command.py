@@ -36,9 +36,8 @@ def test_a_run_becomes_a_page_of_a_stated_size(trained: Path, backbone: str, ans
 
 
 def test_a_format_and_frames_are_chosen(trained: Path, answered, refused) -> None:
-    run = trained / "yang4d"
+    run, folder = trained / "yang4d", trained / "yang4d" / "export" / "ply"
     said = answered("export", run, "--format", "ply", "--frames", "0:2:2")
-    folder = trained / "yang4d" / "export" / "ply"
     assert sorted(path.name for path in folder.iterdir()) == ["frame_00000.ply", "frame_00002.ply"]
     assert f"2 files in {folder}" in said
     assert "the background behind the Gaussians is left out" in said
@@ -48,9 +47,7 @@ def test_a_format_and_frames_are_chosen(trained: Path, answered, refused) -> Non
     assert "4dgs" in refused("export", run, "--format", "splatv")
 
 
-def test_a_share_of_the_gaussians_is_kept_and_what_that_costs_is_said(
-    trained, tmp_path, capsys, refused, monkeypatch
-) -> None:
+def test_a_share_of_the_gaussians_is_kept_and_its_cost_said(trained, tmp_path, capsys, refused, monkeypatch) -> None:
     monkeypatch.setattr(compact, "STEPS", 20)
     run, sizes = str(trained / "yang4d"), []
     for keep in ("1", "0.25"):

@@ -135,6 +135,10 @@ def test_the_slider_and_the_play_button_move_time(new_page: Callable[[], Page], 
     assert page.run("d2.then((player) => player.camera.moved)") is True
     page.page.keyboard.press("h")
     assert page.run("d2.then((player) => player.camera.moved)") is False
+    page.page.keyboard.press("o")
+    for act, key in (("down", "KeyW"), ("down", "Shift"), ("up", "KeyW"), ("up", "Shift")):
+        getattr(page.page.keyboard, act)(key)
+    assert page.run("d2.then((player) => [player.held.size, player.swinging])") == [0, False], "it flies on"
     assert page.complaints == []
 
 

@@ -2,6 +2,7 @@
 "use strict";
 
 const byId = (id) => document.getElementById(id);
+const keyOf = ({ key }) => (key.length > 1 ? key : key.toLowerCase());  // a letter is the same with Shift or Caps Lock
 const RECORDED = "recorded";
 const LEAST_SHAPE = 0.8;      // width / height of the image on a tall screen: more height would show what nobody recorded
 const ORBIT_SECONDS = 16;     // of one swing
@@ -82,7 +83,7 @@ class Player {
     for (const id of ["left", "right", "wipe"]) on(id, "input", () => this.change());
     addEventListener("resize", () => this.change());
     addEventListener("keydown", (event) => this.key(event));
-    addEventListener("keyup", (event) => this.held.delete(event.key));
+    addEventListener("keyup", (event) => this.held.delete(keyOf(event)));
     addEventListener("blur", () => this.held.clear());
   }
 
@@ -120,7 +121,7 @@ class Player {
   }
 
   key(event) {
-    const { tagName, type } = event.target, { key } = event;
+    const { tagName, type } = event.target, key = keyOf(event);
     if (event.ctrlKey || event.metaKey || event.altKey || tagName === "SELECT") return;
     if ((type === "range" && key.startsWith("Arrow")) || (tagName === "BUTTON" && key === " ")) return;
     const modes = [...byId("mode").options].map((option) => option.value);
@@ -131,8 +132,9 @@ class Player {
     };
     if (!acts[key] && !KEYS_OF_FLIGHT[key] && !KEYS_OF_ORBIT[key]) return;
     event.preventDefault();
-    if (acts[key]) acts[key]();
-    else this.held.add(key);
+    if (acts[key]) return acts[key]();
+    this.swing(false);
+    this.held.add(key);
   }
 
   change() { this.wanted = true; this.sharp = false; this.touched = performance.now(); }
