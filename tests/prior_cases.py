@@ -1,5 +1,6 @@
 """For tests of priors: sources that show something else, stores byte by byte, depth maps as COLMAP writes them."""
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -7,8 +8,12 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.emulated_multiview import emulated_multiview
+from d2_plugin.priors.frame import describe_recording
 from d2_plugin.priors.geometry import viewing_rays
+from d2_plugin.protocol import Label
 from d2_plugin.recordings.recording import Camera, Recording, Source
+from d2_plugin.store.maps import FusedPrior
+from d2_plugin.store.store import PriorStore
 
 Shown = Callable[[str, int], "np.ndarray | None"]
 
@@ -63,6 +68,17 @@ def write_dense_array(path: Path, depth: np.ndarray) -> None:
     """Write a depth map [H, W] as COLMAP would."""
     height, width = depth.shape
     path.write_bytes(f"{width}&{height}&1&".encode() + np.ascontiguousarray(depth, dtype="<f4").tobytes())
+
+
+def write_prior(recording: Recording, path: Path, depth_of: Callable[[int], float]) -> PriorStore:
+    """Verified depth of all views, in every pixel the one of the frame."""
+    store = PriorStore.create(path, [*recording.cameras], recording.frames, describe_recording(recording))
+    for name, frame in itertools.product(recording.cameras, recording.frames):
+        image = recording.image(name, frame)
+        depth, labels = np.float32(depth_of(frame)), np.uint8(Label.VERIFIED)
+        maps = (np.full(image.shape[:2], value) for value in (depth, labels, np.float32(0)))
+        store.write(name, frame, FusedPrior(*maps, image), {})
+    return store
 
 
 def write_multiview(

@@ -69,10 +69,8 @@ class TestNames:
     def test_the_index_that_hust_calls_a_name_leads_to_the_path(self) -> None:
         model, scene = hust4d.make()
         adapter = Hust4DAdapter(model, scene, "fine")
-        assert [(adapter.view(c).camera, adapter.view(c).frame) for c in scene.cameras] == [
-            (view.camera, view.frame) for view in make_views()
-        ]
-
+        seen, expected = map(adapter.view, scene.cameras), make_views()
+        assert [(view.camera, view.frame) for view in seen] == [(view.camera, view.frame) for view in expected]
         infos = [SimpleNamespace(image_path=path) for path in scene.train_camera.dataset.image_paths]
         listed = SimpleNamespace(train_camera=SimpleNamespace(dataset=infos))
         assert Hust4DAdapter(model, listed, "fine").view(scene.cameras[4]).camera == "cam1"

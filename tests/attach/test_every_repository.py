@@ -71,8 +71,7 @@ class TestAdapter:
     def test_it_is_registered_and_keeps_the_public_contract(self, name: str) -> None:
         def make() -> Example:
             made = VARIANTS[name]()
-            grow = next(iter(made.edits.values()))
-            return Example(made.adapter, made.cameras, optimizers=made.optimizers, grow=grow)
+            return Example(made.adapter, made.cameras, optimizers=made.optimizers, grow=next(iter(made.edits.values())))
 
         assert isinstance(make().backbone, load(ADAPTERS, name.split()[0]))
         assert isinstance(make().backbone, Backbone)

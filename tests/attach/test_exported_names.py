@@ -8,11 +8,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from mimics.workplace import fused_prior
+from prior_cases import write_prior
+from refusals import refuses
 from stand_in_recordings import smooth_recording
 from tiny import TinyStore
 
-from d2_plugin.errors import D2Error
 from d2_plugin.priors.frame import describe_recording
 from d2_plugin.protocol import EXPORT_FILE
 from d2_plugin.recordings.export.export import export_recording
@@ -28,10 +28,7 @@ def exported(tmp_path: Path) -> SimpleNamespace:
     cloud = PointCloud(np.random.default_rng(0).random((200, 3)) + [0, 0, 2.0], np.full((200, 3), 0.5))
     first = [*recording.cameras][:1]
     folder = export_recording(recording, "colmap_frames", tmp_path / "data", test_cameras=first, cloud=cloud)
-    store = PriorStore.create(tmp_path / "prior", [*recording.cameras], recording.frames, describe_recording(recording))
-    for camera in recording.cameras:
-        for frame in recording.frames:
-            store.write(camera, frame, fused_prior(2.0 + frame, recording.image(camera, frame)), {})
+    write_prior(recording, tmp_path / "prior", lambda frame: 2.0 + frame)
     names = json.loads((folder / EXPORT_FILE).read_text())
     return SimpleNamespace(recording=recording, folder=folder, prior=tmp_path / "prior", names=names)
 
@@ -52,10 +49,9 @@ def test_the_path_of_a_image_leads_to_the_names(exported, caplog) -> None:
 
 
 def test_a_prior_of_the_export_itself_keeps_its_names(exported, tmp_path: Path) -> None:
-    described = {name: {"size": [1, 1], "K": [[1]], "T_camera_world": [[1]]} for name in ("cam00", "cam01")}
-    store = PriorStore.create(
-        tmp_path / "own", ["cam00", "cam01"], [0], {"recording": "data", "calibrations": described}
-    )
+    names, camera = ["cam00", "cam01"], {"size": [1, 1], "K": [[1]], "T_camera_world": [[1]]}
+    about = {"recording": "data", "calibrations": dict.fromkeys(names, camera)}
+    store = PriorStore.create(tmp_path / "own", names, [0], about)
     assert renamed_by(store, str(exported.folder / "cam00" / "0.png")) is store
 
 
@@ -80,18 +76,15 @@ def test_a_prior_of_half_the_size_finds_its_names_too(exported, tmp_path: Path) 
 
 
 def test_an_unknown_name_says_the_way_out(exported) -> None:
-    with pytest.raises(D2Error, match=r"unknown camera of the prior store 'cam09'.*`exported`.*function `key`"):
-        PriorStore.open(exported.prior).prior("cam09", 0)
+    told = r"unknown camera of the prior store 'cam09'.*`exported`.*function `key`"
+    refuses(told, PriorStore.open(exported.prior).prior, "cam09", 0)
 
 
 def test_a_camera_of_the_recording_without_a_prior_has_none(exported, tmp_path: Path) -> None:
     some = [*exported.recording.cameras][1:]
-    about = describe_recording(exported.recording)
-    PriorStore.create(tmp_path / "part", some, exported.recording.frames, about)
-    renamed = opened(str(tmp_path / "part"), str(exported.folder))
-    assert renamed.prior("cam00", 0) is None
+    PriorStore.create(tmp_path / "part", some, exported.recording.frames, describe_recording(exported.recording))
+    assert opened(str(tmp_path / "part"), str(exported.folder)).prior("cam00", 0) is None
 
 
 def test_a_folder_without_export_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(D2Error, match="give the folder that `d2 export-recording` wrote"):
-        RenamedStore.of_export(TinyStore(), tmp_path)
+    refuses("give the folder that `d2 export-recording` wrote", RenamedStore.of_export, TinyStore(), tmp_path)

@@ -66,8 +66,7 @@ def test_a_field_that_returns_nan_is_not_accepted_and_stays_finite() -> None:
 def test_every_point_is_inverted_at_its_own_time() -> None:
     targets, times, ones = targets_of(3), torch.tensor([0.0, 1.0, 2.0]), torch.ones(3)
     wind = torch.tensor([1.0, 0.0, 0.0])
-    points = Points(targets, targets, times, ones, ones)
-    inversion = invert_at_times(points, lambda x, time: x + time * wind, NOBODY)
+    inversion = invert_at_times(Points(targets, targets, times, ones, ones), lambda x, time: x + time * wind, NOBODY)
     torch.testing.assert_close(inversion.positions, targets - times[:, None] * wind)
     assert inversion.accepted.all()
 

@@ -76,8 +76,7 @@ def test_edits_come_once_for_each_step_that_counts(caplog: pytest.LogCaptureFixt
     """A run of 200 steps that are worth 50 edits as often as one of 50, and has its losses in all of its steps."""
     caplog.set_level(logging.INFO, "d2_plugin")
     hook = Counted()
-    table = {"densify": {}}
-    d2 = D2Hooks.from_config(table, Slow(make_model()), TinyStore(), {"counted": hook}, iterations=200)
+    d2 = D2Hooks.from_config({"densify": {}}, Slow(make_model()), TinyStore(), {"counted": hook}, iterations=200)
     for step in range(1, 201):
         d2.loss(step, make_views()[0])
         d2.step(step)
@@ -91,5 +90,4 @@ def test_edits_come_once_for_each_step_that_counts(caplog: pytest.LogCaptureFixt
 
 def test_a_schedule_of_the_users_own_counts_the_same_way() -> None:
     config = D2Config.from_dict({"iterations": 400, "densify": {"stop": 30}}, pace=lambda step: step // 4)
-    usual = D2Config.from_dict({"iterations": 100, "densify": {"stop": 30}})
-    assert config.densify == usual.densify
+    assert config.densify == D2Config.from_dict({"iterations": 100, "densify": {"stop": 30}}).densify

@@ -14,7 +14,6 @@ from refusals import refuses
 from d2_plugin.attach import cpu, repairs
 from d2_plugin.attach.packages import STAND_INS, StandIn, missing, needed, needs, stand_in_for
 from d2_plugin.attach.recipes import recipe
-from d2_plugin.errors import D2Error
 
 
 @pytest.fixture
@@ -73,8 +72,7 @@ def test_what_nothing_stands_in_for_is_one_sentence_with_the_command(script: Pat
 
 
 def test_ours_takes_the_place_and_the_rest_says_so_when_it_is_called(script: Path, monkeypatch, caplog) -> None:
-    ours = StandIn({"absent_one.part.clamp": "torch:clamp"}, "it is made up")
-    monkeypatch.setitem(STAND_INS, "absent_one", ours)
+    monkeypatch.setitem(STAND_INS, "absent_one", StandIn({"absent_one.part.clamp": "torch:clamp"}, "it is made up"))
     monkeypatch.setitem(STAND_INS, "absent_two", StandIn({}, "it is made up"))
     stand_in_for(script, set())
     assert "absent_one is missing: D2 stands in for what training calls of it (it is made up)" in caplog.text
@@ -145,8 +143,6 @@ def test_the_doctor_lists_what_a_trainer_lacks(script: Path, monkeypatch) -> Non
 
 
 def test_a_script_that_is_no_python_is_one_sentence(tmp_path: Path) -> None:
-    (tmp_path / "train.py").write_text("root:x:0:0:root:/root:/bin/bash")
-    with pytest.raises(
-        D2Error, match=r"train\.py is no Python that this version reads .* give the trainer's repository"
-    ):
-        needs(recipe("fudan"), tmp_path / "train.py")
+    path = tmp_path / "train.py"
+    path.write_text("root:x:0:0:root:/root:/bin/bash")
+    refuses(r"train\.py is no Python that this version reads .* give the trainer's", needs, recipe("fudan"), path)

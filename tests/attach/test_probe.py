@@ -107,8 +107,7 @@ def test_gsplat_gives_its_own_depth_once() -> None:
     adapter, views = GsplatAdapter(splats, optimizers, strategy.initialize_state()), make_views()[:2]
     drawn = [gsplat.render(splats, view) for view in views]
     depths = torch.stack([image.depth_sum for image in drawn])
-    shown = adapter.rendered(views, depths, depths / 3)
-    for view, image in zip(shown, drawn, strict=True):
+    for view, image in zip(adapter.rendered(views, depths, depths / 3), drawn, strict=True):
         depth_sum, alpha = adapter.rendered_depth(view)
         assert torch.equal(depth_sum, image.depth_sum)
         assert torch.equal(alpha, image.depth_sum / 3)

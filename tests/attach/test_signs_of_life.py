@@ -104,8 +104,7 @@ class TestSchedules:
     def test_the_trainer_says_its_length_in_the_first_line(self, workplace: Path) -> None:
         (workplace / "d2.toml").write_text('prior = "prior"\n[densify]\n')
         gaussians, scene = fudan.make()
-        d2 = D2Hooks.attach("d2.toml", "fudan", gaussians, scene, iterations=400)
-        assert d2.config.densify.stop == 200
+        assert D2Hooks.attach("d2.toml", "fudan", gaussians, scene, iterations=400).config.densify.stop == 200
 
     def test_a_schedule_that_ends_early_is_warned_of(self, caplog) -> None:
         logged(ALL_HOOKS, iterations=30000)

@@ -11,7 +11,6 @@ from refusals import refuses
 from repositories import clone, make_cem4dgs, make_gsplat, make_gsplat_dynamic, make_swift4d
 from torch import Tensor, nn
 
-from d2_plugin import D2Error
 from d2_plugin.adapters.gsplat_dict import GsplatAdapter
 from d2_plugin.adapters.successors.gsplat_dynamic import GsplatDynamicAdapter
 from d2_plugin.protocol import Points
@@ -62,8 +61,7 @@ class TestGsplat:
         splats, optimizers, _ = gsplat.make()
         splats["velocities"] = nn.Parameter(torch.zeros(60, 3))
         optimizers["velocities"] = torch.optim.Adam([splats["velocities"]])
-        with pytest.raises(D2Error, match=r"parameter 'velocities' of shape \(60, 3\).*new_rows"):
-            GsplatAdapter(splats, optimizers).insert(some_points(2))
+        refuses(r"'velocities' of shape \(60, 3\).*new_rows", GsplatAdapter(splats, optimizers).insert, some_points(2))
         adapter = GsplatAdapter(splats, optimizers, new_rows=lambda points: {"velocities": 0 * points.positions})
         assert adapter.insert(some_points(2)) == 2
         refuses("have means but no 'scales'", GsplatAdapter, {"means": splats["means"]}, optimizers)
@@ -132,8 +130,7 @@ def motion_of(model, children: Tensor) -> Tensor:
 class TestGsplatDynamic:
     def test_an_item_without_its_number_of_frames_is_refused(self) -> None:
         params, optimizers, hexplane, net = gsplat_dynamic.make()
-        with pytest.raises(D2Error, match="the strategy's state has no 'dynamic_mask'"):
-            GsplatDynamicAdapter(params, optimizers, {}, hexplane, net)
+        refuses("strategy's state has no 'dynamic_mask'", GsplatDynamicAdapter, params, optimizers, {}, hexplane, net)
         state = {"dynamic_mask": torch.ones(60, dtype=torch.bool)}
         adapter = GsplatDynamicAdapter(params, optimizers, state, hexplane, net)
         refuses(r"got no number of frames: pass views.*`frames=`", adapter.view, gsplat_dynamic.items()[0])

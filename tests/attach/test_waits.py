@@ -53,9 +53,7 @@ ON_THE_GPU = sorted(VARIANTS.keys() - {"deformable3d 6dof"})
 def test_motion_waits_once_a_step(name: str, fake_gpu: FakeGpu) -> None:  # noqa: F811
     adapter, cameras = on_the_gpu(name)
     d2 = D2Hooks(D2Config(finite_every=0, motion=MotionConfig()), adapter, Halfway())
-    for step, camera in enumerate(
-        (*cameras, cameras[0]), 1
-    ):  # views are checked, priors read, SSIM's window made, once
+    for step, camera in enumerate((*cameras, cameras[0]), 1):  # what is checked, read or made once
         d2.loss(step, camera)
         d2.step(step)
     with fake_gpu.counting():
@@ -74,8 +72,7 @@ def test_parallax_waits_once_a_step_where_it_knows_what_is_in_sight(name: str, f
         d2.loss(step, cameras[step % len(cameras)])
         d2.step(step)
     with fake_gpu.counting():
-        term = d2.loss(25, cameras[25 % len(cameras)])
-        term.backward()
+        d2.loss(25, cameras[25 % len(cameras)]).backward()
         waits, copied = own(fake_gpu.where), Counter(fake_gpu.copied)
     assert sum(waits.values()) <= 1, waits  # the pairs to sort
     assert copied["to device"] <= 8 * WIDTH * HEIGHT + SMALL, copied  # its codes and colours
@@ -109,8 +106,7 @@ def test_a_step_waits_once_and_copies_no_more_than_the_codes(name: str, fake_gpu
     with fake_gpu.counting():
         d2.step(3)
         waits = own(fake_gpu.where)
-    views = len(cameras)
-    assert sum(waits.values()) <= (PER_VIEW + (name in ONE_MORE)) * views + PER_EVALUATION, waits
+    assert sum(waits.values()) <= (PER_VIEW + (name in ONE_MORE)) * len(cameras) + PER_EVALUATION, waits
     if name != "hust4d coarse":
         assert d2.log.inserted > 0
 

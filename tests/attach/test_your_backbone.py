@@ -7,15 +7,13 @@ import sys
 from pathlib import Path
 
 import pytest
-from mimics.workplace import fused_prior
+from prior_cases import write_prior
 from stand_in_recordings import smooth_recording
 from tiny import make_model
 
 from d2_plugin import registry
-from d2_plugin.priors.frame import describe_recording
 from d2_plugin.recordings import open_recording
 from d2_plugin.recordings.export.folder import save_recording
-from d2_plugin.store.store import PriorStore
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "your-backbone.md"
 BLOCKS = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)
@@ -28,12 +26,7 @@ def folder(tmp_path: Path) -> Path:
     for name, block in zip(("drift.py", "test_drift.py", "train.py"), BLOCKS, strict=True):
         (tmp_path / name).write_text(block)
     save_recording(smooth_recording(CAMERAS, frames=2, width=32, height=24), tmp_path / "recording")
-    recording = open_recording(tmp_path / "recording")
-    about = describe_recording(recording)
-    store = PriorStore.create(tmp_path / "prior", list(CAMERAS), recording.frames, about)
-    for camera in CAMERAS:
-        for frame in recording.frames:
-            store.write(camera, frame, fused_prior(3.0, recording.image(camera, frame)), {})
+    write_prior(open_recording(tmp_path / "recording"), tmp_path / "prior", lambda frame: 3.0)
     return tmp_path
 
 
@@ -69,9 +62,8 @@ def test_somebody_elses_backbone_is_found_by_name(tmp_path: Path, monkeypatch: p
     info = tmp_path / "their_package-1.0.dist-info"
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: their-package\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text(
-        "[d2_plugin.backbones]\ntheirs = their_module\n[d2_plugin.adapters]\ntheirs = their_module:adapt\n"
-    )
+    points = "[d2_plugin.backbones]\ntheirs = their_module\n[d2_plugin.adapters]\ntheirs = their_module:adapt\n"
+    (info / "entry_points.txt").write_text(points)
     (tmp_path / "their_module.py").write_text(
         "from d2_plugin.adapters.yang4d import Yang4DAdapter as adapt\n"
         "from d2_plugin.backbones.yang4d import Trainer, TrainSettings, create, settings_from\n"

@@ -26,8 +26,7 @@ def deforming() -> Deform:
 class TestModel:
     def test_a_new_field_moves_nothing(self) -> None:
         model = make_model(backbone="deform")
-        still = model.offsets(model.gaussians["positions"], 0.3)
-        assert all(not part.any() for part in still)
+        assert all(not part.any() for part in model.offsets(model.gaussians["positions"], 0.3))
         assert not torch.equal(deforming().slice_at(make_views()[0]).means, model.gaussians["positions"])
 
     def test_a_gaussian_fades_away_from_its_instant_and_goes_where_the_field_says(self) -> None:
@@ -136,9 +135,8 @@ class TestField:
         def evaluate(*values: torch.Tensor) -> tuple[torch.Tensor, ...]:
             return tuple(torch.func.functional_call(field, dict(zip(names, values)), (positions, 0.37)))
 
-        assert torch.autograd.gradcheck(
-            evaluate, [p.detach().requires_grad_() for p in field.parameters()], fast_mode=True
-        )
+        values = [parameter.detach().requires_grad_() for parameter in field.parameters()]
+        assert torch.autograd.gradcheck(evaluate, values, fast_mode=True)
 
     def test_positions_far_outside_the_box_stay_finite(self) -> None:
         far = torch.tensor([[1e6, -1e6, 1e6], [1e30, 0, 0]], dtype=torch.float64)

@@ -182,8 +182,7 @@ def test_a_run_of_four_steps_for_each_view_ends_with_a_look_at_each(backbone, it
 
 def test_training_lowers_the_loss_of_the_tiny_scene(backbone: str) -> None:
     losses: list[float] = []
-    trainer = make_trainer(iterations=100, backbone=backbone)
-    trainer.run(on_step=lambda step, loss: losses.append(loss))
+    make_trainer(iterations=100, backbone=backbone).run(on_step=lambda step, loss: losses.append(loss))
     assert sum(losses[-6:]) < 0.5 * sum(losses[:6])
 
 
@@ -232,8 +231,7 @@ class TestColour:
         for degree, time_degree in ((0, 0), (2, 0), (1, 2)):
             coefficients = sh.coefficients_from_rgb(rgb, degree, time_degree)
             assert coefficients.shape == (7, sh.channel_count(degree, time_degree), 3)
-            phase = torch.rand(7)
-            torch.testing.assert_close(sh.colors(coefficients, directions, phase, degree, time_degree), rgb)
+            torch.testing.assert_close(sh.colors(coefficients, directions, torch.rand(7), degree, time_degree), rgb)
 
     def test_time_modulates_with_the_cosine_of_the_phase(self) -> None:
         coefficients = torch.zeros(1, sh.channel_count(0, 1), 3)
@@ -289,8 +287,7 @@ def test_black_is_no_trap(backbone: str, degree: int) -> None:
         model.gaussians["base_colors"].copy_(sh.coefficients_from_rgb(torch.full((COUNT, 3), -0.05), 0, 0))
     view = make_views()[0]
     for wanted, leads in ((1.0, True), (-1.0, False)):
-        splats = model.slice_at(view)
-        colors = model.colors(view, splats)
+        colors = model.colors(view, model.slice_at(view))
         assert (colors == 0).all()
         (gradient,) = torch.autograd.grad((colors - wanted).square().sum(), model.gaussians["base_colors"])
         assert bool((gradient < 0).any()) is leads, f"towards {wanted}"

@@ -11,7 +11,7 @@ import torch
 from tiny import ALL_HOOKS, HEIGHT, WIDTH, TinyStore, make_views
 
 from d2_plugin.config import DensifyConfig, DepthLossConfig, PruneConfig
-from d2_plugin.protocol import Label, Points
+from d2_plugin.protocol import Points
 from d2_plugin.store.maps import FusedPrior
 from d2_plugin.store.store import PriorStore
 
@@ -36,13 +36,6 @@ def furnish(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (folder / "d2.toml").write_text(replace(HOOKS, prior="prior").to_toml())
     monkeypatch.chdir(folder)
     return folder
-
-
-def fused_prior(depth: float, image: np.ndarray) -> FusedPrior:
-    """The same verified depth in every pixel of an image [H, W, 3] uint8."""
-    shape = image.shape[:2]
-    labels, sigma = np.full(shape, Label.VERIFIED, np.uint8), np.zeros(shape, np.float32)
-    return FusedPrior(np.full(shape, depth, np.float32), labels, sigma, image)
 
 
 def some_points(count: int) -> Points:

@@ -7,7 +7,6 @@ from hypothesis import strategies as st
 from refusals import refuses
 from scipy.optimize import minimize
 
-from d2_plugin.errors import D2Error
 from d2_plugin.priors.monocular import align as module
 from d2_plugin.priors.monocular.affine import AffineFit, charbonnier, fit_affine
 from d2_plugin.priors.monocular.align import Alignment, AlignStatus, align, aligned_depth, not_aligned, rank_correlation
@@ -50,8 +49,7 @@ def test_zeros_of_a_saturated_network_are_neither_fitted_nor_given_a_depth() -> 
 
 def test_subsampling_changes_the_aligned_depth_by_less_than_a_thousandth(monkeypatch: pytest.MonkeyPatch) -> None:
     depth = np.tile(depths(), (4, 4))
-    rng = np.random.default_rng(3)
-    mono = (1 / depth - 0.05) / 0.3 * (1 + rng.normal(0, 0.02, depth.shape))
+    mono = (1 / depth - 0.05) / 0.3 * (1 + np.random.default_rng(3).normal(0, 0.02, depth.shape))
     maps = []
     for most in (10**6, 20_000):
         monkeypatch.setattr(module, "MAX_ANCHORS", most)
@@ -61,8 +59,7 @@ def test_subsampling_changes_the_aligned_depth_by_less_than_a_thousandth(monkeyp
 
 def test_depth_that_is_not_positive_is_left_empty_and_never_clamped() -> None:
     alignment = Alignment(AlignStatus.OK, "relative", scale=1.0, shift=-0.5)
-    mono = np.array([[0.2, 0.5, 0.501, 0.6, np.nan, np.inf]])
-    out = aligned_depth(mono, alignment, z_far=100.0)
+    out = aligned_depth(np.array([[0.2, 0.5, 0.501, 0.6, np.nan, np.inf]]), alignment, z_far=100.0)
     np.testing.assert_allclose(out, [[0, 0, 0, 10, 0, 0]], rtol=1e-6)
     assert out.dtype == np.float32
     metric = Alignment(AlignStatus.OK, "metric", scale=2.0, shift=-1.0)
@@ -88,8 +85,7 @@ def test_the_rank_correlation_is_spearmans_also_of_equal_values() -> None:
 def test_mistakes_are_told_in_one_sentence(change: dict, message: str) -> None:
     arguments = {"mono": np.ones(SHAPE), "geometric": np.ones(SHAPE), "kind": "relative", "settings": AlignSettings()}
     refuses(message, align, **(arguments | change))
-    with pytest.raises(D2Error, match="did you mean 'absolute'"):
-        align(np.ones(SHAPE), np.ones(SHAPE), kind="metric", settings=AlignSettings(residual="absolut"))
+    refuses("did you mean 'absolute'", AlignSettings, residual="absolut")
 
 
 def objective(scale: float, shift: float, x: np.ndarray, y: np.ndarray, w: np.ndarray, epsilon: float) -> float:
@@ -162,8 +158,7 @@ def test_the_standard_error_is_that_of_repeated_draws() -> None:
         return fit_affine(x, 2 * x + 0.5 + rng.normal(0, 0.1, 400), epsilon=0.05)
 
     fits = [draw(seed) for seed in range(200)]
-    spread = np.std([fit.scale for fit in fits])
-    assert np.mean([fit.scale_error for fit in fits]) == pytest.approx(spread, rel=0.15)
+    assert np.mean([fit.scale_error for fit in fits]) == pytest.approx(np.std([fit.scale for fit in fits]), rel=0.15)
 
 
 def test_the_penalty_keeps_its_digits_at_both_ends() -> None:
@@ -226,8 +221,7 @@ def test_each_case_is_solved_to_its_certificate_and_used_or_refused_for_the_righ
     (x, y), expected = CASES[name]
     absolute = residual == "absolute"
     settings = AlignSettings(residual=residual, epsilon=0.01 if absolute else 0.02)
-    alignment = align(x[None], y[None], kind="metric", settings=settings)
-    assert alignment.status in {expected, *ALSO_RIGHT.get(name, ())}
+    assert align(x[None], y[None], kind="metric", settings=settings).status in {expected, *ALSO_RIGHT.get(name, ())}
     if len(x):
         epsilon = settings.epsilon * (float(np.median(y)) if absolute else 1)
         assert fit_affine(x, y, None if absolute else 1 / y, epsilon=epsilon).gap <= CERTIFIED

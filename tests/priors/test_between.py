@@ -102,8 +102,7 @@ class TestRegions:
         assert not any(self.matched(*pair) for pair in ((alone, alone), (alone, nothing), (nothing, alone)))
 
     def test_of_two_each_goes_its_own_way(self) -> None:
-        large = ball(90, 55, 10)
-        matched = self.matched(shown(self.start, large), shown(self.end, ball(60, 57, 10)))
+        matched = self.matched(shown(self.start, ball(90, 55, 10)), shown(self.end, ball(60, 57, 10)))
         assert {tuple(np.round(shift, -1)) for shift in matched} == {(30, -10), (-30, 0)}
 
     def test_what_is_half_hidden_at_the_end_is_matched_or_left_out(self) -> None:

@@ -210,8 +210,7 @@ def test_in_the_paper_a_refused_view_is_empty_with_its_reason_and_the_others_are
 
 
 def test_without_monocular_depth_geometric_depth_stands_alone_and_that_is_said(plain: Recording, begun: Path) -> None:
-    summary = build_priors(replace(plain, mono_kind=None), NAMES, begun, SETTINGS)
-    assert "without a second source" in str(summary)
+    assert "without a second source" in str(build_priors(replace(plain, mono_kind=None), NAMES, begun, SETTINGS))
     store = PriorStore.open(begun)
     assert store.record("train0", 0)["variant"] == "mvs"
     assert set(np.unique(store.prior("train0", 0).labels)) == {Label.EMPTY, Label.VERIFIED}
@@ -245,9 +244,7 @@ def test_the_papers_preset_is_the_papers_equations_and_nothing_else(plain: Recor
         inverse = alignment.scale * mono.astype(np.float64) + alignment.shift
         aligned = np.where(inverse > 1 / z_far, 1 / np.maximum(inverse, 1 / z_far), 0)
         verified = known & (np.abs(aligned - geometric) < 0.1 * geometric)
-        labels = np.select(
-            [verified, known, aligned > 0], [Label.VERIFIED, Label.CONFLICT, Label.MONO], int(Label.EMPTY)
-        )
+        labels = np.select([verified, known, aligned > 0], [Label.VERIFIED, Label.CONFLICT, Label.MONO], Label.EMPTY)
         differ = found.labels.numpy() != labels
         assert differ.mean() < 1e-3, "but where rounding of stored depth crosses a threshold"
         depth = np.select([labels == Label.VERIFIED, labels == Label.MONO], [geometric, aligned], 0)
@@ -350,7 +347,7 @@ def cluster() -> Iterator[object]:
 
 
 def test_a_worker_killed_in_the_middle_changes_no_byte_of_the_store(still, still_built, cluster, tmp_path) -> None:
-    (worker,), killed, seen = cluster.workers.values(), [], []
+    (worker,), at, killed, seen = cluster.workers.values(), cluster.scheduler_address, [], []
 
     def kill(done: int, total: int, note: str) -> None:
         seen.append((done, total))
@@ -358,9 +355,7 @@ def test_a_worker_killed_in_the_middle_changes_no_byte_of_the_store(still, still
             killed.append(worker.pid)
             os.kill(worker.pid, signal.SIGKILL)
 
-    summary = build_priors_on_cluster(
-        still, STILL_NAMES, tmp_path / "p", REUSE, scheduler=cluster.scheduler_address, progress=kill
-    )
+    summary = build_priors_on_cluster(still, STILL_NAMES, tmp_path / "p", REUSE, scheduler=at, progress=kill)
     assert worker.pid not in killed
     assert seen[0][0] < 10
     assert seen[-1] == (10, 10)

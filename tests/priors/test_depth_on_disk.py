@@ -85,8 +85,7 @@ def write_maps(recording: Recording, place: str, frame: int, scale: float = 1.0)
 
 
 def workspace(recording: Recording, place: str = "") -> WorkspaceDepth:
-    settings = StereoSettings(matcher="workspace", folder=place)
-    found = find_depth_on_disk(recording, NAMES, settings)
+    found = find_depth_on_disk(recording, NAMES, StereoSettings(matcher="workspace", folder=place))
     assert isinstance(found, WorkspaceDepth)
     return found
 
@@ -172,8 +171,7 @@ def test_one_camera_with_a_depth_sensor_has_a_verified_prior(recording: Recordin
     store = PriorStore.open(recording.path / "priors")
     prior, truth = store.prior("train0", 0), recording.depth("train0", 0)
     verified = prior.labels.numpy() == Label.VERIFIED
-    error = np.abs(prior.depth.numpy() - truth)[verified] / truth[verified]
-    assert np.median(error) < 1e-3
+    assert np.median(np.abs(prior.depth.numpy() - truth)[verified] / truth[verified]) < 1e-3
     record = store.record("train0", 0)
     assert record["stereo"]["matcher"] == "sensor"
     assert record["bounds"] is None
@@ -233,8 +231,7 @@ def test_images_of_all_frames_may_share_one_workspace(recording: Recording) -> N
             number = len(rows) + 1
             rows.append(f"{number} {line.split(' ', 1)[1].replace(f'{name}.png', f'{name}/{frame:05d}.png')}\n\n")
             (maps / name).mkdir(exist_ok=True)
-            path = maps / name / f"{frame:05d}.png.photometric.bin"
-            write_dense_array(path, recording.depth(name, frame))
+            write_dense_array(maps / name / f"{frame:05d}.png.photometric.bin", recording.depth(name, frame))
     images.write_text("".join(rows))
     source = workspace(recording)
     for frame in recording.frames:
@@ -331,8 +328,7 @@ def test_depth_that_is_asked_for_and_absent_is_told(recording: Recording, matche
     ["elsewhere/{number}", "{frame:99999999999d}", "{frame.__class__}", "{frame:.99999999999f}", "{frame", "{}"],
 )
 def test_braces_never_fill_the_memory_or_look_things_up(place: str, tmp_path: Path) -> None:
-    camera = Camera("a", 8, 6, np.eye(3), np.eye(4))
-    source = WorkspaceDepth(tmp_path, place, [camera], [0])
+    source = WorkspaceDepth(tmp_path, place, [Camera("a", 8, 6, np.eye(3), np.eye(4))], [0])
     refuses("braces around other than frame", source.has_maps, 0)
 
 
@@ -381,8 +377,7 @@ def test_a_sensor_is_as_sure_as_it_says_and_a_pixel_it_does_not_trust_is_no_dept
     assert (after.labels.numpy()[:, 60:] == Label.EMPTY).all()
     both = kept & (after.depth > 0).numpy()
     np.testing.assert_allclose(after.depth.numpy()[both], before.depth.numpy()[both], rtol=1e-3)
-    expected = before.sigma.numpy()[both] / sure[both]
-    np.testing.assert_allclose(after.sigma.numpy()[both], expected, rtol=0.05)
+    np.testing.assert_allclose(after.sigma.numpy()[both], before.sigma.numpy()[both] / sure[both], rtol=0.05)
 
 
 @pytest.mark.parametrize("wrong", [-0.1, 1.5, np.nan])

@@ -106,8 +106,7 @@ def test_what_nothing_is_known_of_stays_unknown_however_well_two_maps_agree() ->
 
 @pytest.mark.parametrize("label", [Label.FAR, Label.AGREED, Label.EMPTY, Label.CONFLICT])
 def test_far_and_empty_pixels_have_no_say_and_agreed_ones_do(label: Label) -> None:
-    theirs = prior_of(WALL if label in (Label.FAR, Label.AGREED) else 0.0, label)
-    compared = left_of(prior_of(WALL), theirs)
+    compared = left_of(prior_of(WALL), prior_of(WALL if label in (Label.FAR, Label.AGREED) else 0.0, label))
     if label == Label.AGREED:
         assert share(compared, Label.AGREED) > 0.5
     else:
@@ -154,8 +153,7 @@ def test_a_colour_is_compared_in_the_exposure_of_the_other_camera(mine: int, see
     greys = (100, mine), (120, seen)
     colors = [np.tile(np.where(half[:, None], left, right), (HEIGHT, 1, 3)) for left, right in greys]
     ours, theirs = (replace(p, colors=c.astype(np.uint8)) for p, c in zip((ours, verified), colors, strict=True))
-    compared = left_of(ours, theirs)
-    right = compared.labels[:, 3 * WIDTH // 4 :]
+    right = left_of(ours, theirs).labels[:, 3 * WIDTH // 4 :]
     assert bool(np.mean(right == Label.AGREED) > 0.3) is taken
 
 

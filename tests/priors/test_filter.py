@@ -35,8 +35,7 @@ def views(recording: Recording) -> tuple[list, list, list, list]:
 
 def test_true_depth_survives_where_another_view_sees_it(recording: Recording) -> None:
     grays, cameras, depths, costs = views(recording)
-    results = filter_depths(grays, cameras, depths, costs, SETTINGS)
-    for result, depth in zip(results, depths):
+    for result, depth in zip(filter_depths(grays, cameras, depths, costs, SETTINGS), depths):
         assert (result.depth > 0).mean() > 0.5
         np.testing.assert_array_equal(result.depth[(result.depth > 0)], depth[(result.depth > 0)])
         alone = result.unconfirmed > 0  # what one view sees, and it alone
@@ -74,8 +73,7 @@ def test_bad_matches_are_dropped(recording: Recording) -> None:
     assert not results[0].depth.any()
     assert not results[0].unconfirmed.any()
     # A depth that did not match is not there, so it cannot confirm another view either.
-    strict = filter_depths(grays, cameras, depths, costs, replace(SETTINGS, min_sources=2))
-    assert not strict[1].depth.any()
+    assert not filter_depths(grays, cameras, depths, costs, replace(SETTINGS, min_sources=2))[1].depth.any()
 
 
 def test_nan_and_negative_depths_are_no_depths(recording: Recording) -> None:
@@ -96,8 +94,7 @@ def test_more_confirmations_can_be_asked_for(recording: Recording) -> None:
         kept.append(filter_depths(grays, cameras, depths, costs, chosen)[1].depth.astype(bool).mean())
     assert kept[0] > kept[1] > 0
     assert kept[2] == kept[1]  # there are only two other views
-    count = confirm(1, cameras, depths, SETTINGS).sources
-    assert set(np.unique(count)) == {0, 1, 2}
+    assert set(np.unique(confirm(1, cameras, depths, SETTINGS).sources)) == {0, 1, 2}
 
 
 def test_texture_is_the_spread_of_grey_values_in_a_window() -> None:
@@ -127,15 +124,13 @@ def plane(slope_x: float, slope_y: float, shape: tuple[int, int] = SHAPE) -> np.
 
 
 def coherence(depth: np.ndarray, gray: np.ndarray | None = None) -> np.ndarray:
-    flat = np.full(SHAPE, 128, np.uint8)
-    return surface_coherence(flat if gray is None else gray, depth)
+    return surface_coherence(np.full(SHAPE, 128, np.uint8) if gray is None else gray, depth)
 
 
 @settings(max_examples=20, deadline=None)
 @given(st.floats(-0.003, 0.003), st.floats(-0.003, 0.003), st.floats(1e-3, 1e3))
 def test_a_slanted_plane_of_any_scale_is_coherent(slope_x: float, slope_y: float, scale: float) -> None:
-    inner = coherence(plane(slope_x, slope_y) * np.float32(scale))[10:-10, 10:-10]
-    assert inner.min() > 0.99
+    assert coherence(plane(slope_x, slope_y) * np.float32(scale))[10:-10, 10:-10].min() > 0.99
 
 
 def test_a_wrong_piece_of_a_plane_is_not_coherent_and_leaves_its_surroundings_alone() -> None:

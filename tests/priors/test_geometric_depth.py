@@ -42,8 +42,7 @@ def run(recording: Recording, bounds: tuple[float, float], settings: StereoSetti
 
 def test_half_resolution_comes_back_at_full_size() -> None:
     pair = synthetic_recording(cameras=2, held_out=0, frames=1, width=256, height=144, arc_degrees=10)
-    results = run(pair, (2.0, 9.0), replace(SETTINGS, max_pixels=128 * 72))
-    found = np.stack([result.depth for result in results])
+    found = np.stack([result.depth for result in run(pair, (2.0, 9.0), replace(SETTINGS, max_pixels=128 * 72))])
     truth = np.stack([pair.depth(name, 0) for name in pair.cameras])
     assert found.shape == (2, 144, 256)
     assert (found > 0).mean() > 0.05
@@ -54,15 +53,13 @@ def test_half_resolution_comes_back_at_full_size() -> None:
 
 def test_half_the_size_fills_what_the_full_size_leaves_empty(pair, matched, monkeypatch) -> None:
     monkeypatch.setattr("d2_plugin.priors.stereo.geometric_depth.SCALES", (1,))
-    full = run(pair, (2.0, 9.0))
-    for camera, one, alone in zip(pair.cameras, matched, full):
+    for camera, one, alone in zip(pair.cameras, matched, run(pair, (2.0, 9.0))):
         known = alone.depth > 0
         np.testing.assert_array_equal(one.depth[known], alone.depth[known])
         filled = (one.depth > 0) & ~known
         assert filled.sum() > 0.02 * known.sum()
         assert one.record["survivors"]["filled"] == np.count_nonzero(one.depth)
-        truth = pair.depth(camera, 0)
-        errors = np.abs(one.depth[filled] / truth[filled] - 1)
+        errors = np.abs(one.depth[filled] / pair.depth(camera, 0)[filled] - 1)
         assert np.median(errors) < 0.01
         assert (errors < 2 * one.sigma[filled]).mean() > 0.75
         assert np.median(one.sigma[filled]) > np.median(one.sigma[known])
@@ -70,15 +67,13 @@ def test_half_the_size_fills_what_the_full_size_leaves_empty(pair, matched, monk
 
 def geometric(depth: np.ndarray) -> GeometricDepth:
     """One view's depth with a sigma of one per cent."""
-    sigma = np.where(depth > 0, 0.01, np.inf).astype(np.float32)
-    return GeometricDepth(depth, sigma, np.zeros_like(depth), {})
+    return GeometricDepth(depth, np.where(depth > 0, 0.01, np.inf).astype(np.float32), np.zeros_like(depth), {})
 
 
 def test_enlarging_a_plane_is_exact_and_an_edge_is_left_out() -> None:
     v, u = np.mgrid[:20, :30]
     inverse = 0.2 + 0.001 * u + 0.002 * v
-    small = geometric((1 / inverse).astype(np.float32))
-    large = enlarged(small, 60, 40, tolerance=0.05)
+    large = enlarged(geometric((1 / inverse).astype(np.float32)), 60, 40, tolerance=0.05)
     v, u = (np.mgrid[:40, :60] + 0.5) / 2 - 0.5
     inside = np.s_[2:-2, 2:-2]  # the outermost pixels extrapolate, and take the value at the rim
     np.testing.assert_allclose(large.depth[inside], (1 / (0.2 + 0.001 * u + 0.002 * v))[inside], rtol=1e-5)
@@ -127,8 +122,7 @@ def test_the_range_from_triangulated_points_holds_what_two_views_see() -> None:
 def test_cameras_that_look_at_each_other_across_a_room_have_a_range_that_holds_it() -> None:
     """At wide angles disparity says nothing about the near end, but the frusta do."""
     room = synthetic_recording(cameras=3, held_out=0, frames=1, width=160, height=90, arc_degrees=120)
-    cameras = [replace(camera, near_far=None) for camera in room.cameras.values()]
-    bounds = depth_bounds(cameras)
+    bounds = depth_bounds([replace(camera, near_far=None) for camera in room.cameras.values()])
     truth = np.concatenate([room.depth(name, 0).ravel() for name in room.cameras])
     assert 0.05 * truth.min() < bounds.near < truth.min()
     assert bounds.far > truth.max()

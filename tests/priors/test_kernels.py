@@ -86,12 +86,10 @@ class TestStereoFilter:
         grays = [gray(recording.image(camera, 5)) for camera in chosen]
         noise, truths = np.random.default_rng(0), [recording.depth(camera, 5) for camera in chosen]
         depths = [truth * noise.lognormal(0, 0.01, truth.shape).astype(np.float32) for truth in truths]
-        rig = grays, [recording.cameras[camera] for camera in chosen], depths
-        assert_is_the_oracle(self.compiled, rig)
+        assert_is_the_oracle(self.compiled, (grays, [recording.cameras[camera] for camera in chosen], depths))
 
     def test_does_not_depend_on_threads(self, same_for_any_threads: Callable) -> None:
-        rig = self.rig(3, 61, 43, 1.0, 1e-3, 1)
-        same_for_any_threads(lambda: self.compiled(rig))
+        same_for_any_threads(lambda: self.compiled(self.rig(3, 61, 43, 1.0, 1e-3, 1)))
 
     def test_does_not_depend_on_the_unit_of_the_world(self) -> None:
         """Cross products of float32 coordinates would end at 1e9 of a unit, and below 1e-10 of one."""
@@ -151,8 +149,7 @@ class TestPrecision:
         seed=st.integers(0, 1000),
     )
     def test_is_the_bits_of_the_oracle(self, width, height, exponent, noise, known, window, seed) -> None:
-        maps = self.maps(width, height, 10.0**exponent, noise, known, seed)
-        assert_is_the_oracle(self.compiled, maps, window)
+        assert_is_the_oracle(self.compiled, self.maps(width, height, 10.0**exponent, noise, known, seed), window)
 
     @pytest.mark.parametrize("value", [1e-45, 1e-38, 1e-6, 1e6, 3e38, 0.0, -1.0, np.nan, np.inf])
     @pytest.mark.parametrize("name", ["depth", "coherence", "parallax", "spread", "gradient"])
@@ -163,8 +160,7 @@ class TestPrecision:
         assert not np.isnan(self.compiled(maps)[0]).any()
 
     def test_does_not_depend_on_threads(self, same_for_any_threads: Callable) -> None:
-        maps = self.maps(61, 43, 1.0, 1e-3, 0.9, 1)
-        same_for_any_threads(lambda: self.compiled(maps))
+        same_for_any_threads(lambda: self.compiled(self.maps(61, 43, 1.0, 1e-3, 0.9, 1)))
 
 
 class TestCrossView:

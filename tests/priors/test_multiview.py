@@ -15,7 +15,6 @@ from prior_cases import camera_at, contents, showing, write_multiview
 from refusals import refuses
 
 from benchmarks.emulated_multiview import emulated_multiview
-from d2_plugin.errors import D2Error
 from d2_plugin.priors.build import PriorSettings, build_priors
 from d2_plugin.priors.declared_error import held_against_truth
 from d2_plugin.priors.frame import Frame
@@ -122,15 +121,13 @@ def test_files_are_read_as_the_exporters_name_their_arrays(room: Recording, tmp_
         ({}, "no array 'depth'"),
         ({"depth": np.ones((4, 6, 8))}, "of 3 views"),
         ({"depth": np.ones((6, 8))}, "of 3 views"),
-        ({"depth": np.ones((3, 6, 8)), "conf": np.ones((3, 5, 8))}, "expected [3, 6, 8]"),
+        ({"depth": np.ones((3, 6, 8)), "conf": np.ones((3, 5, 8))}, r"expected \[3, 6, 8\]"),
         ({"depth": np.ones((3, 6, 8)), "extrinsics": np.ones((2, 3, 4))}, "poses"),
         ({"depth": np.ones((3, 6, 8)), "intrinsics": np.ones((3, 4))}, "intrinsics"),
     ],
 )
 def test_arrays_that_do_not_belong_together_are_one_sentence(arrays: dict, words: str) -> None:
-    with pytest.raises(D2Error) as caught:
-        understood(arrays, "x.npz", (3,))
-    assert words in str(caught.value)
+    refuses(words, understood, arrays, "x.npz", (3,))
 
 
 def test_files_that_hold_no_prediction_are_one_sentence(tmp_path: Path) -> None:
@@ -205,8 +202,7 @@ def test_where_nothing_is_matched_the_views_that_agree_give_a_prior(room: Record
 
 
 def spoilt_noise(arrays: dict[str, np.ndarray], frame: int) -> None:
-    random = np.random.default_rng(frame)
-    arrays["depth"] *= np.exp(random.normal(0, 0.6, arrays["depth"].shape)).astype(np.float32)
+    arrays["depth"] *= np.exp(np.random.default_rng(frame).normal(0, 0.6, arrays["depth"].shape)).astype(np.float32)
 
 
 def spoilt_views(arrays: dict[str, np.ndarray], frame: int) -> None:
@@ -223,9 +219,7 @@ def test_a_source_that_shows_nothing_leaves_the_prior_as_it_is_or_nearly(room, w
     instant = replace(room, frames=(0,))
     maps = write_multiview(instant, NAMES, tmp_path / "maps", turned=spoilt)
     store = build(instant, tmp_path / "prior", SETTINGS, maps, without)
-    found, expected = (
-        np.stack([each.prior(name, 0).labels.numpy() for name in NAMES]) == Label.VERIFIED for each in (store, without)
-    )
+    found, expected = (np.stack([each.prior(name, 0).verified for name in NAMES]) for each in (store, without))
     assert (found & expected).sum() > 0.99 * expected.sum()
     every = Label.MONO, Label.AGREED
     assert median_error(instant, store, *every) < 1.03 * median_error(instant, without, *every)
@@ -241,10 +235,9 @@ def test_maps_of_other_instants_say_nothing_of_what_moves(tmp_path: Path, moved_
     for frame in long.frames:
         other = long.frames[(frame + moved_on) % len(long.frames)]
         shutil.copyfile(maps / f"{other:05d}.npz", renamed / f"{frame:05d}.npz")
-    source = MultiviewSource(
-        *(long, NAMES, PriorSettings(multiview=str(renamed)), tmp_path / "cache"), partial(Frame.read, long, NAMES)
-    )
-    views = [(frame, *view) for frame in long.frames for view in source.views(Frame.read(long, NAMES, frame)).items()]
+    settings, read = PriorSettings(multiview=str(renamed)), partial(Frame.read, long, NAMES)
+    source = MultiviewSource(long, NAMES, settings, tmp_path / "cache", read)
+    views = [(frame, *view) for frame in long.frames for view in source.views(read(frame)).items()]
     error = np.stack([np.log(map_.depth / long.depth(name, frame)) for frame, name, map_ in views])
     unknown = np.stack([map_.confidence for _, _, map_ in views]) == 0
     wrong = np.abs(error - np.median(error)) > 0.3
@@ -319,8 +312,7 @@ def test_only_what_changed_is_built_again(room: Recording, without: PriorStore, 
 
     for place, turned, built in (("same", None, 0), ("other", changed, 3)):
         maps = write_multiview(room, NAMES, tmp_path / place, posed=True, turned=turned)
-        summary = build_priors(room, NAMES, tmp_path / "prior", replace(settings, multiview=str(maps)))
-        assert summary.built == built
+        assert build_priors(room, NAMES, tmp_path / "prior", replace(settings, multiview=str(maps))).built == built
         assert (contents(store.path) == before) == (built == 0)
 
 
@@ -332,8 +324,7 @@ def test_a_frame_that_the_network_did_not_see_has_the_prior_of_the_other_sources
 
 
 def test_the_cameras_that_the_network_saw_may_be_more_and_in_another_order(room, maps, tmp_path) -> None:
-    order = ["train2", "train0", "train1"]
-    other = write_multiview(room, order, tmp_path / "maps", posed=True)
+    other = write_multiview(room, ["train2", "train0", "train1"], tmp_path / "maps", posed=True)
     (other / "multiview.json").write_text('{"cameras": ["train2", "train0", "train1"], "emulated": true}')
     settings = replace(ALONE, multiview=str(other))
     build_priors(room, NAMES[:2], tmp_path / "prior", settings)
@@ -351,8 +342,7 @@ def test_a_network_of_so_many_views_refuses_another_number_and_runs_once_a_frame
     model = tiny_onnx.mean_network(tmp_path / "net.onnx", 45, 80, batch=3, named="depth")
     settings = replace(ALONE, multiview=str(model))
     refuses("exported for 3 views and would be wrong for 2", build_priors, room, NAMES[:2], tmp_path / "two", settings)
-    summary = build_priors(room, NAMES, tmp_path / "three", settings)
-    assert "surfaces" in summary.reasons(), "brightness is no depth"
+    assert "surfaces" in build_priors(room, NAMES, tmp_path / "three", settings).reasons(), "brightness is no depth"
     monkeypatch.setattr("d2_plugin.priors.multiview.source.understood", lambda *_: pytest.fail("computed again"))
     build_priors(room, NAMES, tmp_path / "three", replace(settings, hanging_limit=0.2))
 

@@ -58,17 +58,15 @@ def test_a_fixed_size_in_patches_of_14_is_taken_for_depth_anything_v2(tmp_path: 
 
 
 def test_half_precision_networks_are_fed_half_precision(tmp_path: Path) -> None:
-    path = tiny_onnx.mean_network(tmp_path / "net.onnx", 30, 40, dtype=tiny_onnx.FLOAT16)
-    model = MonocularModel(path, "relative")
+    model = MonocularModel(tiny_onnx.mean_network(tmp_path / "net.onnx", 30, 40, dtype=tiny_onnx.FLOAT16), "relative")
     assert model.prepare(IMAGE).dtype == np.float16
     assert model(IMAGE).dtype == np.float32
 
 
 def test_enlarging_aligns_the_corners_as_torch_does() -> None:
     small = np.random.default_rng(0).random((7, 9)).astype(np.float32)
-    reference = torch.nn.functional.interpolate(
-        torch.from_numpy(small)[None, None], (50, 33), mode="bilinear", align_corners=True
-    )
+    map_ = torch.from_numpy(small)[None, None]
+    reference = torch.nn.functional.interpolate(map_, (50, 33), mode="bilinear", align_corners=True)
     np.testing.assert_allclose(upsample(small, 50, 33), reference[0, 0].numpy(), atol=1e-5)
     np.testing.assert_array_equal(upsample(small, 7, 9), small)
     np.testing.assert_array_equal(upsample(small[:1, :1], 4, 5), np.full((4, 5), small[0, 0]))
@@ -147,8 +145,7 @@ def test_weights_that_lie_beside_the_network_belong_to_it(tmp_path: Path, place:
         path = tiny_onnx.scaled_network(tmp_path / "network.onnx", place)
         assert external_weights(path) == [weights]
         model = MonocularModel(path, "relative", preprocessing="unit")
-        prediction = model.predict(np.full((6, 8, 3), 51, np.uint8))
-        np.testing.assert_allclose(prediction, factor * 0.2, rtol=1e-6)
+        np.testing.assert_allclose(model.predict(np.full((6, 8, 3), 51, np.uint8)), factor * 0.2, rtol=1e-6)
         found[factor] = model.fingerprint()
     assert found[1.0] != found[2.0]
 

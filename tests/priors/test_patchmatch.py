@@ -12,7 +12,6 @@ from refusals import refuses
 
 from benchmarks.stereo_measure import measure
 from benchmarks.stereo_rigs import Rig, load_rigs, textured_rig
-from d2_plugin.errors import D2Error
 from d2_plugin.priors.geometry import index_intrinsics, pixel_grid, scaled_camera
 from d2_plugin.priors.settings import StereoSettings
 from d2_plugin.priors.stereo import patchmatch as module
@@ -83,8 +82,7 @@ def test_a_depth_range_ten_times_too_wide_does_no_harm(rig: Rig) -> None:
 
 def test_what_one_view_found_helps_the_others(rig: Rig, native: Maps, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "_exchange", lambda *arguments: None)
-    alone = raw(rig)
-    assert share_within(native, rig, 0.01) > share_within(alone, rig, 0.01) + 0.01
+    assert share_within(native, rig, 0.01) > share_within(raw(rig), rig, 0.01) + 0.01
 
 
 def seen_plane(camera: Camera, normal: np.ndarray, offset: float, cost: float) -> LevelView:
@@ -110,8 +108,7 @@ def test_a_plane_handed_over_is_the_same_plane_of_the_world(rig: Rig, normal: tu
     centre = ours.centre + 0.6 * sum(rig.depth_range) * unit * ours.T_camera_world[2, :3]
     facing = np.array(normal) @ ours.T_camera_world[:3, :3]
     target, source = (seen_plane(camera, facing, facing @ centre, 0.1) for camera in (ours, theirs))
-    empty = replace(target, planes=np.zeros_like(target.planes))
-    found = handed_over(empty, [source])
+    found = handed_over(replace(target, planes=np.zeros_like(target.planes)), [source])
     there = found.any(-1)
     u, v = pixel_grid(ours)
     assert there.mean() > 0.2
@@ -169,8 +166,7 @@ def test_pixels_that_are_not_wanted_are_left_alone(rig: Rig) -> None:
     wanted = [np.zeros(image.shape, bool) for image in grays(rig)]
     for mask in wanted:
         mask[:, 60:120] = True
-    result = raw(rig, wanted=wanted)
-    for (depth, cost), mask in zip(result, wanted):
+    for (depth, cost), mask in zip(raw(rig, wanted=wanted), wanted):
         assert (cost[~mask] == NO_MATCH).all()
         assert (depth[mask] > 0).mean() > 0.95
 
@@ -196,12 +192,10 @@ def test_images_may_differ_in_size(rig: Rig) -> None:
 @pytest.mark.skipif(platform.machine() != "x86_64", reason="the oldest x86-64 is meant")
 def test_a_processor_without_wide_vectors_finds_the_same(rig: Rig, native: Maps, monkeypatch) -> None:
     monkeypatch.setenv("D2_CXXFLAGS", "-march=x86-64")
-    plain = raw(rig)
-    assert share_within(plain, rig, 0.01) == pytest.approx(share_within(native, rig, 0.01), abs=0.02)
+    assert share_within(raw(rig), rig, 0.01) == pytest.approx(share_within(native, rig, 0.01), abs=0.02)
 
 
 def test_a_mistake_is_one_sentence(rig: Rig) -> None:
     floats = [image / 255 for image in grays(rig)]
     refuses(r"uint8 \[H, W\], got float64", patchmatch, floats, rig.cameras, rig.depth_range)
-    with pytest.raises(D2Error, match="patchmatch_sources must be at least 1 and at most 32, got 33"):
-        raw(rig, replace(SETTINGS, patchmatch_sources=33))
+    refuses("patchmatch_sources must be at least 1 and at most 32, got 33", replace, SETTINGS, patchmatch_sources=33)

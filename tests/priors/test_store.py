@@ -84,8 +84,7 @@ def test_a_map_of_one_depth_and_a_map_of_none_survive() -> None:
 
 
 def test_sigma_above_one_is_infinite_and_only_an_exact_zero_is_zero() -> None:
-    sigma = np.array([0.0, 1e-9, 1e-4, 0.5, 1.0, 1.01, 1e9, np.inf], np.float32)
-    found = SIGMA[encode_sigma(sigma)]
+    found = SIGMA[encode_sigma(np.array([0.0, 1e-9, 1e-4, 0.5, 1.0, 1.01, 1e9, np.inf], np.float32))]
     np.testing.assert_allclose(found, [0, 1e-4, 1e-4, 0.5, 1, np.inf, np.inf, np.inf], rtol=0.02)
 
 
@@ -167,8 +166,7 @@ def test_stores_of_other_recordings_formats_and_other_folders_are_refused(store:
 
 
 def test_frames_built_before_stay_part_of_the_store(store: PriorStore) -> None:
-    again = PriorStore.create(store.path, ["a", "b"], [5], {"recording": "test"})
-    assert again.frames == (0, 3, 5)
+    assert PriorStore.create(store.path, ["a", "b"], [5], {"recording": "test"}).frames == (0, 3, 5)
     assert PriorStore.open(store.path).prior("a", 0) is not None
 
 

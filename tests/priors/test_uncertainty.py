@@ -112,8 +112,7 @@ def test_a_map_that_says_less_than_its_anchors_proposes_at_most(scenes: list[Sce
         assert found.skill.nil
         assert np.isinf(found.sigma).all()
         assert np.isfinite(found.at_anchors).all(), "it must not veto right stereo"
-        good = monocular_uncertainty(scene.aligned, scene.anchors, SETTINGS).skill
-        assert good.gain > 1 > found.skill.gain
+        assert monocular_uncertainty(scene.aligned, scene.anchors, SETTINGS).skill.gain > 1 > found.skill.gain
 
 
 def test_a_map_that_says_nothing_of_a_pixel_contradicts_no_stereo_there(scenes: list[Scene]) -> None:
@@ -134,8 +133,7 @@ def test_a_confidence_spreads_sigma_and_does_not_change_what_errors_say_of_its_s
     np.testing.assert_allclose(same.sigma, plain.sigma, rtol=1e-4)
     half = np.ones_like(scene.aligned)
     half[:, :120] = 0.5
-    found = monocular_uncertainty(scene.aligned, scene.anchors, SETTINGS, half)
-    ratio = found.sigma / plain.sigma
+    ratio = monocular_uncertainty(scene.aligned, scene.anchors, SETTINGS, half).sigma / plain.sigma
     finite = np.isfinite(ratio)
     left, right = (np.median(ratio[:, part][finite[:, part]]) for part in (slice(0, 118), slice(122, None)))
     assert left == pytest.approx(2 * right, rel=0.01)
@@ -226,12 +224,10 @@ def test_a_good_network_vetoes_an_error_that_the_fixed_threshold_lets_pass() -> 
     good = (truth * np.exp(0.001 * random.standard_normal(truth.shape))).astype(np.float32)
     wrong = random.random(truth.shape) < 0.002
     anchors = np.where(wrong, truth * 1.04, truth).astype(np.float32)
-    scene = Scene(truth, anchors, good, good)
-    by_likelihood = verified(scene, good, anchors, 3.0, 0.001)
+    by_likelihood = verified(Scene(truth, anchors, good, good), good, anchors, 3.0, 0.001)
     assert (by_likelihood.labels[wrong] == Label.CONFLICT).all()
     assert (by_likelihood.labels[~wrong] == Label.VERIFIED).mean() > 0.99
-    fixed = fuse(corrected_depth(good, anchors, SETTINGS), anchors, tau_c=0.1)
-    assert (fixed.labels[wrong] == Label.VERIFIED).all()
+    assert (fuse(corrected_depth(good, anchors, SETTINGS), anchors, tau_c=0.1).labels[wrong] == Label.VERIFIED).all()
 
 
 def test_a_map_that_misses_some_things_is_less_sure_everywhere_and_vetoes_less(scenes: list[Scene]) -> None:
@@ -291,8 +287,7 @@ def test_a_line_that_turns_around_without_a_third_says_nothing_beyond() -> None:
     anchors = np.where(truth < 4, truth, 0)
     near = (anchors > 0) & (anchors < np.quantile(anchors[anchors > 0], 2 / 3))
     aligned[near] = 5.0 - truth[near]  # falls where depth rises, but for the farthest third
-    told = extrapolation_error(aligned, anchors, "metric", SETTINGS)
-    assert np.isinf(told[truth > 8]).all()
+    assert np.isinf(extrapolation_error(aligned, anchors, "metric", SETTINGS)[truth > 8]).all()
 
 
 def test_the_declared_sigma_contains_it() -> None:
@@ -332,8 +327,7 @@ def test_a_patch_of_wrong_anchors_stays_in_conflict() -> None:
     wrong = np.zeros(SHAPE, bool)
     wrong[40:46, 70:76] = True
     geometric = np.where(wrong, depth * 1.25, geometric).astype(np.float32)
-    corrected = corrected_depth(aligned, geometric, SETTINGS)
-    assert (error_of(corrected, depth * 1.25)[wrong] > 0.1).all()
+    assert (error_of(corrected_depth(aligned, geometric, SETTINGS), depth * 1.25)[wrong] > 0.1).all()
 
 
 def test_empty_stays_empty_and_the_paper_has_no_correction() -> None:
@@ -341,15 +335,13 @@ def test_empty_stays_empty_and_the_paper_has_no_correction() -> None:
     aligned[:20] = 0
     corrected = corrected_depth(aligned, geometric, SETTINGS)
     np.testing.assert_array_equal(corrected > 0, aligned > 0)
-    np.testing.assert_array_equal(
-        corrected_depth(aligned, geometric, replace(SETTINGS, local_correction=False)), aligned
-    )
+    papers = replace(SETTINGS, local_correction=False)
+    np.testing.assert_array_equal(corrected_depth(aligned, geometric, papers), aligned)
     np.testing.assert_array_equal(corrected_depth(aligned, np.zeros_like(geometric), SETTINGS), aligned)
 
 
 def test_a_size_that_no_cell_divides_is_no_special_case() -> None:
-    rng = np.random.default_rng(0)
-    aligned = rng.uniform(2, 4, (37, 641)).astype(np.float32)
+    aligned = np.random.default_rng(0).uniform(2, 4, (37, 641)).astype(np.float32)
     corrected = corrected_depth(aligned, (1.1 * aligned).astype(np.float32), SETTINGS)
     np.testing.assert_allclose(corrected, 1.1 * aligned, rtol=0.02)
 

@@ -80,8 +80,7 @@ def test_without_truth_or_without_priors_there_is_no_table(tmp_path: Path, small
     depth = np.full((20, 40), 5.0, np.float32)
     store = store_of(tmp_path / "a", small, depth, np.full(depth.shape, 1, np.uint8), depth)
     assert held_against_truth(store, showing(small, {"depth": lambda *_: None})) is None
-    empty = PriorStore.create(tmp_path / "b", list(small.cameras), [0], {})
-    assert held_against_truth(empty, small) is None
+    assert held_against_truth(PriorStore.create(tmp_path / "b", list(small.cameras), [0], {}), small) is None
 
 
 def test_the_summary_shows_median_sigma_and_parts_add_up() -> None:
@@ -151,9 +150,7 @@ def test_sigma_holds_on_a_recording_with_true_depth(shared_data: Callable[[str],
 
 def test_the_sheet_shows_image_depth_and_labels_of_every_view(tmp_path: Path) -> None:
     recording = synthetic_recording(cameras=2, held_out=0, frames=2, width=64, height=36)
-    store = PriorStore.create(
-        tmp_path / "priors", list(recording.cameras), recording.frames, {"recording": recording.name}
-    )
+    store = PriorStore.create(tmp_path / "store", [*recording.cameras], recording.frames, {"recording": recording.name})
     for camera in recording.cameras:
         labels = np.full((36, 64), Label.MONO, np.uint8)
         labels[:, 32:] = Label.CONFLICT
@@ -161,8 +158,7 @@ def test_the_sheet_shows_image_depth_and_labels_of_every_view(tmp_path: Path) ->
         depth = np.where(labels == Label.CONFLICT, 0, recording.depth(camera, 0))
         sigma = np.where(labels == Label.MONO, 0.05, np.inf).astype(np.float32)
         prior = FusedPrior(depth, labels, sigma, recording.image(camera, 0))
-        record = {"shares": prior.shares(), "refused": "", "monocular": "maps"}
-        store.write(camera, 0, prior, record)
+        store.write(camera, 0, prior, {"shares": prior.shares(), "refused": "", "monocular": "maps"})
     sheet = cv2.imread(str(contact_sheet(store, recording, tmp_path / "out" / "sheet.png", width=64)))[..., ::-1]
     assert sheet.shape == (18 + 2 * (18 + 36), 4 * 64, 3)
     row = sheet[36 : 36 + 36]

@@ -46,16 +46,14 @@ class TestRefinedPoses:
     @pytest.mark.parametrize("degrees", [0.25, 2.0])
     def test_one_camera_that_is_turned_is_named_and_mended(self, degrees: float) -> None:
         truth = arc()
-        given = {**truth, "c2": moved(truth, degrees, 0.0)["c2"]}
-        refined = refine_poses(given, seen_by(truth))
+        refined = refine_poses({**truth, "c2": moved(truth, degrees, 0.0)["c2"]}, seen_by(truth))
         assert [name for name, turn in refined.turns.items() if turn.wrong] == ["c2"]
         assert refined.turns["c2"].degrees == pytest.approx(degrees, abs=0.1)
         assert "camera c2 is turned by" in turns_in_words(refined.turns, truth)[0]
         assert max(degrees_between(refined.cameras[name], truth[name]) for name in truth) < 0.1
 
     def test_poses_that_features_settle_within_degrees_are_not_called_right(self) -> None:
-        said = turns_in_words({"a": Turn(0.1, 0.05, 0.2, False), "b": Turn(1.0, 7.9, 1.5, False)}, "abc")
-        assert said == [
+        assert turns_in_words({"a": Turn(0.1, 0.05, 0.2, False), "b": Turn(1.0, 7.9, 1.5, False)}, "abc") == [
             "poses hold as far as features tell: a within 0.10 degrees (0.2 pixels)",
             "poses that features hardly tell anything of: b within 7.90 degrees (1.5 pixels)",
             "poses not checked: c, too few shared features",
@@ -175,8 +173,7 @@ class TestBoards:
     def test_an_inverted_board_and_one_of_older_programs_are_seen(self) -> None:
         images, board = filmed(arc(2), 0.25)
         assert len(board.corners(255 - images["c0"][0])) == len(board.corners(images["c0"][0])) == 24
-        dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
-        older = cv2.aruco.CharucoBoard((7, 6), 0.25, 0.1875, dictionary)
+        older = cv2.aruco.CharucoBoard((7, 6), 0.25, 0.1875, cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50))
         older.setLegacyPattern(True)
         drawn = cv2.copyMakeBorder(older.generateImage((420, 360)), *[60] * 4, cv2.BORDER_CONSTANT, value=128)
         assert len(replace(board, rows=6).corners(np.repeat(drawn[..., None], 3, 2))) == 30

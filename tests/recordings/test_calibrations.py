@@ -92,8 +92,7 @@ def test_recordings_of_another_size_scale_the_intrinsics(tmp_path: Path) -> None
     [(1000, "millimetres (scale .001)"), (100, "centimetres (scale .01) or, of a small rig, millimetres (scale .001)")],
 )
 def test_units_that_are_no_metres_are_noted_with_the_scale_that_mends_them(per_metre, unit, tmp_path) -> None:
-    cameras = [camera._replace(t=per_metre * camera.t) for camera in rig()]
-    calibration = open_calibration(anipose(tmp_path, cameras))
+    calibration = open_calibration(anipose(tmp_path, [camera._replace(t=per_metre * camera.t) for camera in rig()]))
     (note,) = calibration.notes
     assert f"looks like {unit} instead of metres" in note
     for camera, known in zip(scaled(calibration.cameras, 1 / per_metre), rig(), strict=True):

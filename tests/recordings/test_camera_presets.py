@@ -78,8 +78,7 @@ def test_lists_are_those_of_their_source(name: str, text: str, train: str) -> No
     cameras = tuple(camera for camera in N3DV if (name, camera) != ("cut_roasted_beef", "cam03"))
     split = camera_split(rig(name, cameras), text)
     assert split.train == tuple(train.split())
-    others = {"cam00"} if "gc-4dgs" in text else set(N3DV) - set(split.train)
-    assert set(split.test) == others
+    assert set(split.test) == ({"cam00"} if "gc-4dgs" in text else set(N3DV) - set(split.train))
 
 
 @pytest.mark.parametrize("name", PROTOCOLS)

@@ -33,8 +33,7 @@ def open_tiny(path: Path, cameras: tuple[str, ...] | None = None, intersect: boo
     frames = tuple(images["only"])
     width, height = image_size(images["only"][frames[0]])
     focal = float((path / "focal.txt").read_text())
-    lens = Lens(pinhole(focal, focal, width / 2, height / 2))
-    camera = CalibratedCamera("only", width, height, lens, np.eye(4))
+    camera = CalibratedCamera("only", width, height, Lens(pinhole(focal, focal, width / 2, height / 2)), np.eye(4))
     return assembled(path, {"only": camera}, images, frames, 30.0, "focal.txt")
 
 
@@ -59,8 +58,7 @@ def test_a_reader_is_two_functions_and_a_row_and_an_export_one_function_and_a_ro
     refuses(r"of another layout \(.*colmap, tiny; see", open_recording, tmp_path.parent)
     monkeypatch.setitem(WRITERS, "tiny", write_tiny)
     original = synthetic_recording(cameras=1, frames=2, width=16, height=12)
-    folder = export_recording(original, "tiny", tmp_path / "out")
-    back = open_recording(folder)
+    back = open_recording(export_recording(original, "tiny", tmp_path / "out"))
     np.testing.assert_array_equal(back.cameras["only"].K, original.cameras["train0"].K)
     np.testing.assert_array_equal(back.image("only", 1), original.image("train0", 1))
 

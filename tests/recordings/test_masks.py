@@ -53,8 +53,7 @@ def recorded_folder(path: Path, masks: str = "masks", valid: bool = False) -> Pa
 @pytest.mark.parametrize("folder", MASK_FOLDERS)
 def test_masks_are_read_where_they_lie(folder: str, tmp_path: Path) -> None:
     recording = open_recording(recorded_folder(tmp_path / "recording", folder))
-    mask = recording.mask("cam00", 0)
-    np.testing.assert_array_equal(mask, left_half() / 255)
+    np.testing.assert_array_equal(recording.mask("cam00", 0), left_half() / 255)
     assert recording.mask("cam00", 1) is None
     assert recording.mask("cam01", 0) is None
     assert any(note == f"foreground masks of cam00 from {folder}" for note in recording.notes)
@@ -66,8 +65,7 @@ def test_a_mask_may_have_any_number_of_channels(channels: str, tmp_path: Path) -
     grey, full = left_half(), np.full((H, W), 255, np.uint8)
     layers = {"RGB": [grey] * 3, "opaque": [grey] * 3 + [full], "RGBA": [full // 3] * 3 + [grey]}  # a cut-out person
     write_mask(path / "masks" / "cam00" / "0000.png", np.dstack(layers[channels]))
-    mask = open_recording(path).mask("cam00", 0)
-    np.testing.assert_array_equal(mask, grey / 255)
+    np.testing.assert_array_equal(open_recording(path).mask("cam00", 0), grey / 255)
 
 
 def test_a_mask_of_another_size_is_refused(tmp_path: Path) -> None:

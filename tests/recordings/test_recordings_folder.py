@@ -60,8 +60,7 @@ def test_a_saved_recording_reads_back_bitwise_and_is_not_written_over(original: 
 def test_opening_reads_headers_only(folder: Path) -> None:
     for image in (folder / "images").rglob("*.png"):
         image.write_bytes(image.read_bytes()[:40])
-    recording = open_recording(folder)
-    refuses(r"00000\.png is not a readable PNG or JPEG", recording.image, "train0", 0)
+    refuses(r"00000\.png is not a readable PNG or JPEG", open_recording(folder).image, "train0", 0)
 
 
 def test_maps_are_declared_in_mono_json_and_optional(folder: Path) -> None:

@@ -47,7 +47,6 @@ def test_extracted_frames_are_found_in_every_usual_place(tmp_path: Path, pattern
     assert recording.fps == 30
     assert recording.cameras["cam13"].centre[0] == pytest.approx(ROW[3] + 1)
     assert (recording.image("cam13", 1) == 101).all()
-    assert list(open_recording(tmp_path, cameras=["cam13"]).cameras) == ["cam13"]
 
 
 def test_rows_and_cameras_must_agree_in_number(tmp_path: Path) -> None:
@@ -75,9 +74,8 @@ def test_of_the_whole_rig_a_few_cameras_are_enough_when_asked(tmp_path: Path) ->
     path = n3dv_scene(tmp_path / "scene", 21, (0, 13, 20))
     refuses("21 rows for 3 cameras", open_recording, path)
     recording = open_recording(path, intersect=True)
-    assert {name: camera.centre[0] for name, camera in recording.cameras.items()} == pytest.approx(
-        {"cam00": 0, "cam13": 13, "cam20": 20}, abs=1e-6
-    )
+    places = {name: camera.centre[0] for name, camera in recording.cameras.items()}
+    assert places == pytest.approx({"cam00": 0, "cam13": 13, "cam20": 20}, abs=1e-6)
     assert any("18 of 21 cameras are not there" in note for note in recording.notes)
     lacking = n3dv_scene(tmp_path / "lacking", 18, (0, 13, 17))  # a scene without some: row 13 may be cam15's
     refuses("18 rows for 3 cameras", open_recording, lacking, intersect=True)
@@ -103,8 +101,7 @@ def test_a_video_source_travels_to_another_process_and_ends_where_its_video_does
     video = write_videos(smooth_recording(("00",), frames=6), tmp_path) / "cam00.mp4"
     source = VideoFrames({"a": read_video(video)})
     first = source.image("a", 4)
-    again = pickle.loads(pickle.dumps(source))
-    np.testing.assert_array_equal(again.image("a", 4), first)
+    np.testing.assert_array_equal(pickle.loads(pickle.dumps(source)).image("a", 4), first)
     refuses(r"frame 400 of .*cam00\.mp4 cannot be decoded", source.image, "a", 400)
 
 

@@ -56,8 +56,7 @@ def test_a_image_rotated_by_its_metadata_keeps_the_stored_pixel_order(tmp_path: 
 def test_only_images_need_opencv(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = save_recording(synthetic_recording(cameras=1, frames=1, width=16, height=16), tmp_path / "scene")
     monkeypatch.setitem(sys.modules, "cv2", None)
-    with pytest.raises(MissingExtra, match=r"reading images needs OpenCV.*d2-4dgs\[image\]"):
-        open_recording(path).image("train0", 0)
+    refuses(r"images needs OpenCV.*d2-4dgs\[image\]", open_recording(path).image, "train0", 0, error=MissingExtra)
 
 
 @settings(max_examples=20, deadline=None)
@@ -126,8 +125,7 @@ def test_what_moves_is_seen_later_where_its_scene_flow_says(recording: Recording
     camera, flow = recording.cameras["train1"], scene_flow(recording.source, "train1", 0, 3).reshape(-1, 3)
     moves = np.linalg.norm(flow, axis=1) > 1e-6
     assert 0.01 < moves.mean() < 0.3
-    moved = (world_points(camera, recording.depth("train1", 0)) + flow)[moves]
-    pixels, depth, _ = projected(camera, moved)
+    pixels, depth, _ = projected(camera, (world_points(camera, recording.depth("train1", 0)) + flow)[moves])
     ratio = depth / recording.depth("train1", 3)[tuple(pixels.astype(int).T[::-1])]
     assert np.mean(np.abs(ratio - 1) < 0.02) > 0.7, "what turns away is not seen any more"
     assert np.mean(ratio < 0.97) < 0.1  # only at silhouettes, by up to a pixel
@@ -143,8 +141,7 @@ def test_depth_matches_the_sphere_it_is_told_to_be() -> None:
     depth = render_depth(scene, camera, 0.5).astype(float)
     distances = np.linalg.norm(world_points(camera, depth) - ball.motion(0.5)[1], axis=1)
     assert distances.min() > ball.radius * (1 - 1e-6)
-    on_ball = distances < ball.radius * (1 + 1e-5)
-    assert on_ball.sum() > 50
+    assert (distances < ball.radius * (1 + 1e-5)).sum() > 50
 
 
 def test_the_same_arguments_give_the_same_recording(recording: Recording) -> None:

@@ -64,8 +64,7 @@ def test_known_damaged_images_are_replaced_and_named(tmp_path: Path) -> None:
     alone = open_recording(rig(tmp_path / "without", cameras=10, frames=(173, 174)))
     assert alone.frames == (174,)
     assert any("damaged and left out" in note for note in alone.notes)
-    other = open_recording(rig(tmp_path / "other", cameras=10, frames=(172, 173), scene="Painter"))
-    assert not other.notes
+    assert not open_recording(rig(tmp_path / "other", cameras=10, frames=(172, 173), scene="Painter")).notes
 
 
 def test_files_that_cannot_be_are_refused(tmp_path: Path) -> None:

@@ -51,8 +51,7 @@ def test_intrinsics_beside_a_image_win_and_scale_with_it(tmp_path: Path) -> None
 
 def test_distortion_beside_a_image_is_undone(tmp_path: Path) -> None:
     pytest.importorskip("cv2")
-    frames = two_by_two(fl_x=30.0, k1=0.3)
-    recording = open_recording(write(tmp_path, frames))
+    recording = open_recording(write(tmp_path, two_by_two(fl_x=30.0, k1=0.3)))
     assert any("distortion of cam00, cam07 is undone" in note for note in recording.notes)
     assert (recording.image("cam07", 1)[0, 0] == 0).all()
     fisheye = two_by_two(fl_x=30.0, camera_model="OPENCV_FISHEYE")

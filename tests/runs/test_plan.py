@@ -72,8 +72,7 @@ def test_flow_is_built_where_the_run_is_long_enough_to_use_it_or_its_user_says_s
 
     monkeypatch.setattr("d2_plugin.runs.run.build_priors_for", stop)
     room = save_recording(moving, tmp_path / "room")
-    settings = RunSettings(str(room), PAIR, iterations=iterations, overrides=tables)
-    run = Run(settings, tmp_path / "run")
+    run = Run(RunSettings(str(room), PAIR, iterations=iterations, overrides=tables), tmp_path / "run")
     assert any("[motion] brings it back" in note for note in run.scene.recording.notes) == (not built)
     refuses(f"between: {built}", run.prepare)
 
@@ -110,8 +109,7 @@ def test_what_cannot_be_is_not_overridden(moving) -> None:
 def camera(name: str, x: float = 0.0, turn: float = 0.0, near_far: tuple[float, float] | None = None) -> Camera:
     """At (x, 0, 0), turned to the right by `turn` degrees; 100 pixels wide, 53 degrees."""
     rotation = rotation_of_vector(np.array([0, -np.deg2rad(turn), 0]))
-    T = rigid(rotation, -rotation @ [x, 0, 0])
-    return Camera(name, 100, 80, pinhole(100, 100, 50, 40), T, near_far)
+    return Camera(name, 100, 80, pinhole(100, 100, 50, 40), rigid(rotation, -rotation @ [x, 0, 0]), near_far)
 
 
 AT_TWO = (1.999, 2.001)
@@ -141,8 +139,7 @@ def rig(recording: Recording, *cameras: Camera) -> Recording:
 
 
 def test_cameras_that_share_nothing_have_no_stereo_and_the_reason_says_how_little(moving) -> None:
-    apart = rig(moving, camera("a", 0, -90), camera("b", 0.5, 90))
-    plan = plan_scene(apart, PAIR, "relative maps")
+    plan = plan_scene(rig(moving, camera("a", 0, -90), camera("b", 0.5, 90)), PAIR, "relative maps")
     assert not plan.uses("stereo")
     assert plan.as_dict()["stereo"]["reason"].startswith("no overlap: 2 training cameras, at most 0% of each image")
     assert not plan.uses("verification")
@@ -195,8 +192,7 @@ def test_a_sensor_beside_one_of_two_cameras_leaves_stereo(moving, tmp_path: Path
     plan = plan_scene(recording, PAIR, None)
     assert [plan.uses(name) for name in ("sensor", "stereo")] == [False, True]
     assert "does not serve every training camera" in plan.as_dict()["sensor"]["reason"]
-    settings = PriorSettings(stereo=StereoSettings(matcher="patchmatch"))
-    assert plan_scene(recording, PAIR, None, settings).uses("stereo")
+    assert plan_scene(recording, PAIR, None, PriorSettings(stereo=StereoSettings(matcher="patchmatch"))).uses("stereo")
 
 
 def test_no_stereo_reaches_the_priors(moving, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -207,8 +203,7 @@ def test_no_stereo_reaches_the_priors(moving, tmp_path: Path, monkeypatch: pytes
         for frame in (0, 1):
             np.save(path / "mono" / name / f"{frame:05d}.npy", moving.depth(name, frame))
     monkeypatch.setattr(matched_depth, "geometric_depth", lambda *_: pytest.fail("something was matched"))
-    settings = RunSettings(str(path), ("train0", "train1"))
-    scene = Scene.open(settings)
+    scene = Scene.open(RunSettings(str(path), ("train0", "train1")))
     assert [scene.plan.uses(name) for name in ("stereo", "monocular", "verification")] == [False, True, False]
     summary = build_priors_for(scene, np.zeros((0, 3)), tmp_path / "priors")
     assert any("nothing matched" in note for note in summary.notes)

@@ -56,8 +56,7 @@ def write_run(folder: Path, psnr: float | None = 25.0, **more: object) -> Path:
         **more,
     }
     write_table(folder / "metrics.json", metrics, METRICS)
-    hooks = tuple(metrics["hooks"])
-    settings = RunSettings("/data/den", ("a", "b"), iterations=500, hooks=hooks, seed=7)
+    settings = RunSettings("/data/den", ("a", "b"), iterations=500, hooks=tuple(metrics["hooks"]), seed=7)
     write_table(folder / "run.json", settings.as_table(), RUN)
     return folder
 
@@ -92,8 +91,7 @@ def test_the_same_rows_make_the_same_bytes_and_nothing_is_typed_in(report: Path,
 
 def test_plots_are_well_formed_and_the_page_needs_nothing_from_outside(report: Path) -> None:
     for path in report.glob("*.svg"):
-        root = ET.fromstring(path.read_text())
-        assert root[0].tag.endswith("title"), "a screen reader says what it is"
+        assert ET.fromstring(path.read_text())[0].tag.endswith("title"), "a screen reader says what it is"
         assert "prefers-color-scheme:dark" in path.read_text()
         assert f"]({path.name})" in (report / "report.md").read_text()
     page = (report / "report.html").read_text()
@@ -104,9 +102,8 @@ def test_plots_are_well_formed_and_the_page_needs_nothing_from_outside(report: P
 
 class TestGroups:
     def test_names_say_what_ran_and_d2_stands_first_of_each_length(self) -> None:
-        names = [f"yang4d{rest}" for rest in (" pearson", "", " full", " mvs_only", " full, x", ", x")] + [
-            "deform full"
-        ]
+        yang = (f"yang4d{rest}" for rest in (" pearson", "", " full", " mvs_only", " full, x", ", x"))
+        names = [*yang, "deform full"]
         rows = [scored(name, 0, target, psnr=20.0) for target in ("30 s", "10 s") for name in names]
         groups = groups_of([*rows, scored("yang4d full", 0, "try", psnr=1.0)])
         order = ["D²", "D² (deform)", "D², x", "stereo alone", "backbone alone", "backbone alone, x", "pearson"]
@@ -212,8 +209,7 @@ def test_folders_of_runs_are_searched_and_an_image_of_each_method_is_kept(tmp_pa
     rows, images = collect([tmp_path / "runs"])
     assert len(rows) == 3
     assert [image.caption.split(":")[0] for image in images] == ["den, yang4d", "den, yang4d + D2"]
-    page = make_report(rows, tmp_path / "report", images)[0].read_text()
-    assert page.count("<img ") == 2
+    assert make_report(rows, tmp_path / "report", images)[0].read_text().count("<img ") == 2
     refuses("no finished run lies in", collect, [tmp_path / "report"])
 
 
@@ -228,5 +224,4 @@ def test_any_range_of_values_has_an_axis_with_its_ticks_inside(values: list[floa
 def test_markdown_keeps_bars_inside_their_cell_and_stresses_the_best() -> None:
     table = Table(("name", "dB"), (("a|b", "28.9 ± 0.5"), ("c", "3")), frozenset({(0, 1)}))
     assert markdown(table).splitlines() == ["| name | dB |", "| --- | --- |", r"| a\|b | **28.9 ± 0.5** |", "| c | 3 |"]
-    best = Table(("a",), (("1|2",),), frozenset({(0, 0)}))
-    assert markdown(best).splitlines()[-1] == r"| **1\|2** |"
+    assert markdown(Table(("a",), (("1|2",),), frozenset({(0, 0)}))).splitlines()[-1] == r"| **1\|2** |"

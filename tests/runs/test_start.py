@@ -33,13 +33,11 @@ def test_kept_images_do_not_grow_with_the_number_of_frames(recording, monkeypatc
         assert image.shape == (54, 96, 3)
         assert len(frames._kept) <= 2
     view = frames.views[0]
-    expected = torch.from_numpy(recording.image(view.camera, view.frame)).float() / 255
-    assert torch.equal(frames.image(0), expected)
+    assert torch.equal(frames.image(0), torch.from_numpy(recording.image(view.camera, view.frame)).float() / 255)
 
 
 def test_extent_comes_from_points_where_there_are_enough(recording) -> None:
-    points = surface_points(recording, 500)
-    extent = scene_extent(recording, CAMERAS, points)
+    extent = scene_extent(recording, CAMERAS, surface_points(recording, 500))
     depth = recording.depth("train0", 0)
     assert extent.near < np.percentile(depth, 5)
     assert extent.far > np.percentile(depth, 95)

@@ -210,8 +210,7 @@ def test_a_run_that_is_scored_again_still_says_what_was_tried(settings, tmp_path
     short = replace(settings, iterations=3)
     run_of(short, tmp_path / "run").train()
     (tmp_path / "priors" / "trials.json").unlink()
-    metrics = Run(short, tmp_path / "run").evaluate(images=False)
-    assert metrics["trials"]["choice"] == "stereo"
+    assert Run(short, tmp_path / "run").evaluate(images=False)["trials"]["choice"] == "stereo"
     assert D2Config.from_toml(tmp_path / "run" / "d2.toml").believe == "stereo"
 
 
@@ -231,6 +230,5 @@ def test_the_choice_is_that_of_full_runs(shared_data, tmp_path, name, cameras, f
     settings = RunSettings(str(shared_data(name)), cameras, frames=frames, **mono)
     run = Run(settings, tmp_path / "run")
     points = run.prepare()
-    scene = run.scene.with_points(points, settings)
-    trials = leave_out_in_turn(settings, scene, points, PriorStore.open(run.priors))
+    trials = leave_out_in_turn(settings, run.scene.with_points(points, settings), points, PriorStore.open(run.priors))
     assert trials.choice == choice, str(trials)

@@ -224,8 +224,7 @@ def test_case_24_the_survey_does_not_depend_on_the_unit_of_length(path: Path) ->
     for unit in (1e-3, 1.0, 1e6):
         scaled = scene._replace(means=scene.means * unit, covariances=scene.covariances * unit**2)
         prior = DepthPrior((depth.double() * unit).to(path.dtype), labels)
-        settings = RasterSettings(near=0.2 * unit)
-        results.append(survey(scaled.splats, scene.view, prior, settings, eps=1e-8 * unit))
+        results.append(survey(scaled.splats, scene.view, prior, RasterSettings(near=0.2 * unit), eps=1e-8 * unit))
     for other in (results[0], results[2]):
         torch.testing.assert_close(other.weight, results[1].weight, rtol=1e-3, atol=1e-3)
         torch.testing.assert_close(other.error, results[1].error, rtol=1e-3, atol=1e-3)

@@ -121,9 +121,8 @@ class TestDeformable3D:
             [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
             [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
         ]
-        factors = (
-            torch.stack([torch.stack(row, -1) for row in rows], 1) * (model["_scaling"][:3].exp() + scales)[:, None]
-        )
+        turned = torch.stack([torch.stack(row, -1) for row in rows], 1)
+        factors = turned * (model["_scaling"][:3].exp() + scales)[:, None]
         assert close(drawn.covariances[:3, [0, 3, 5]].sum(1), factors.square().sum((1, 2)), 1e-2)
         assert found.backbone.colors(seen(found, half), drawn).shape == (40, 3)
 
@@ -167,8 +166,7 @@ class Test4DGaussians:
         found = open_viewed(tmp_path, room)
         # Frame 2 of 4 is at its time 2 / 4: readers of several cameras divide by the number of frames.
         assert seen(found, found.recording.seconds(2)).time == pytest.approx(0.5)
-        at = seen(found, official.TIME * 4 / found.recording.fps)
-        drawn = found.backbone.slice_at(at)
+        drawn = found.backbone.slice_at(seen(found, official.TIME * 4 / found.recording.fps))
         assert close(drawn.means[:3], official.BENT["as by default"][1])
         assert close(drawn.opacities, torch.sigmoid(model["_opacity"][:, 0]))
 
@@ -213,8 +211,7 @@ class Test4DGaussians:
 class TestClouds:
     def test_a_point_cloud_of_spacetime_gaussians_moves_with_the_recording(self, room: Path, tmp_path: Path) -> None:
         gaussians = spacetime.make()[0]
-        generator = torch.Generator().manual_seed(4)
-        gaussians._motion = 0.2 * torch.randn(gaussians._motion.shape, generator=generator)
+        gaussians._motion = 0.2 * torch.randn(gaussians._motion.shape, generator=torch.Generator().manual_seed(4))
         columns = official.places(gaussians._xyz) | official.columns_of(
             trbf_center=gaussians._trbf_center, trbf_scale=gaussians._trbf_scale, opacity=gaussians._opacity,
             motion=gaussians._motion, f_dc=gaussians._features_dc[:, :3], omega=gaussians._omega,
@@ -237,8 +234,7 @@ class TestClouds:
         first = tmp_path / "ply" / "frame_00000.ply"
         found = open_viewed(first, room)
         view = seen(viewed, 0.0, "train1")
-        difference = (render_view(found.backbone, view).color - render_view(viewed.backbone, view).color).abs()
-        assert difference.max() < 0.02
+        assert (render_view(found.backbone, view).color - render_view(viewed.backbone, view).color).abs().max() < 0.02
         assert {"x", "opacity", "rot_3"} <= set(read_ply(first))
 
     def test_a_point_cloud_of_4c4d_has_its_time(self, room: Path, tmp_path: Path) -> None:
@@ -340,8 +336,7 @@ def test_an_exported_checkpoint_of_4d_gaussians_has_the_same_lines(room: Path, t
 @pytest.mark.parametrize("name", ["hust4d", "swift4d"])
 def test_live_colours_are_those_that_the_field_leaves(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Configurations for several cameras deform harmonics (no_dshs=False); Swift4D those of what moves alone."""
-    trainer = {"hust4d": hust4d, "swift4d": swift4d}[name]
-    model, scene = trainer.make()
+    model, scene = {"hust4d": hust4d, "swift4d": swift4d}[name].make()
     model.training_setup(default_options())
     adapter: Any = registry.load(registry.ADAPTERS, name)(model, scene, "coarse")
     view = View("a", 0, 0.2, torch.eye(4), torch.eye(3), 4, 4)

@@ -41,8 +41,7 @@ def test_every_pose_of_an_orbit_is_a_camera_pose(cameras: list[Camera]) -> None:
 
 def test_an_orbit_looks_at_the_focus_from_one_distance_and_stays_inside_the_cameras() -> None:
     point, poses = focus(ARC), orbit(ARC, 40)
-    distances = [np.linalg.norm(pose.centre - point) for pose in poses]
-    assert np.ptp(distances) < 1e-9
+    assert np.ptp([np.linalg.norm(pose.centre - point) for pose in poses]) < 1e-9
     for pose in poses:
         ahead = pose.T_camera_world[:3, :3] @ point + pose.T_camera_world[:3, 3]
         assert np.allclose(ahead[:2], 0, atol=1e-9)
@@ -76,8 +75,7 @@ def test_home_and_the_limits_of_a_free_camera_follow_from_where_cameras_stood() 
 
 def test_parallel_cameras_have_a_focus_in_front_of_them() -> None:
     forwards = np.tile([0.0, 0, 1], (2, 1))
-    found = focus_of(np.array([[0.0, 0, 0], [1, 0, 0]]), forwards, depth=5.0)
-    assert np.allclose(found, [0.5, 0, 5])
+    assert np.allclose(focus_of(np.array([[0.0, 0, 0], [1, 0, 0]]), forwards, depth=5.0), [0.5, 0, 5])
 
 
 @pytest.mark.parametrize("size", [(192, 108), (48, 27), (100, 54), (54, 96)])

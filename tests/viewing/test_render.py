@@ -48,8 +48,7 @@ def rendered(trained: Path) -> Callable[[str, int], np.ndarray]:
 
 
 def test_a_held_out_camera_plays_the_whole_recording_as_the_rasterizer_draws_it(trained, tmp_path, rendered) -> None:
-    said = run(RenderSettings((trained,), output=tmp_path / "a.mp4", quality=10))
-    assert "4 images of 96x54, 12 per second" in said
+    assert "4 images of 96x54, 12 per second" in run(RenderSettings((trained,), output=tmp_path / "a.mp4", quality=10))
     found = video_of(tmp_path / "a.mp4")
     assert len(found) == 4
     assert found[0].shape == (54, 96, 3)
@@ -114,23 +113,18 @@ def test_every_kind_of_image_stands_beside_the_others_and_runs_below(trained: Pa
     again = tmp_path / "again"
     shutil.copytree(trained, again)
     show = tuple(KINDS)
-    settings = RenderSettings(
-        (trained, again), output=tmp_path / "a.mp4", path="training", cameras=("train1",), show=show, seconds=0.1
-    )
-    run(settings)
+    which = {"path": "training", "cameras": ("train1",), "show": show, "seconds": 0.1}
+    run(RenderSettings((trained, again), output=tmp_path / "a.mp4", **which))
     [image] = video_of(tmp_path / "a.mp4")
-    width = len(show) * 96 + (len(show) - 1) * 4
-    assert image.shape == (2 * (54 + 20) + 4, width, 3)
+    assert image.shape == (2 * (54 + 20) + 4, len(show) * 96 + (len(show) - 1) * 4, 3)
     assert min(panel.std() for panel in np.array_split(image[24:74], len(show), axis=1)) > 3, "no panel is empty"
 
 
 def test_panels_show_what_they_say(viewed: ViewedRun) -> None:
-    camera = viewed.recording.cameras["train1"]
-    shot = Shot(viewed, viewed.view(camera, 0.0), (1.0, 9.0))
+    shot = Shot(viewed, viewed.view(viewed.recording.cameras["train1"], 0.0), (1.0, 9.0))
     assert np.array_equal(KINDS["truth"](shot).image, viewed.recording.image("train1", 0))
     difference = np.abs(shot.rendered.color.numpy() - viewed.recording.image("train1", 0) / np.float32(255))
-    expected = -10 * np.log10(np.mean(difference**2))
-    assert f"{expected:.1f} dB" in KINDS["error"](shot).caption
+    assert f"{-10 * np.log10(np.mean(difference**2)):.1f} dB" in KINDS["error"](shot).caption
     depth = KINDS["true-depth"](shot)
     assert "1..9" in depth.caption
     assert depth.bar is not None
@@ -169,8 +163,7 @@ def test_a_run_of_which_nothing_is_left_or_known_is_one_sentence(trained, tmp_pa
 @pytest.mark.parametrize("command", ["render", "export"])
 def test_a_run_that_still_trains_and_has_no_prior_is_shown_with_a_note(bare, tmp_path, answered, command) -> None:
     folder = shutil.copytree(bare, tmp_path / "<script>alert(1)<")
-    state = torch.load(folder / "checkpoint.pt", weights_only=True)
-    save_checkpoint(folder / "checkpoint.pt", state | {"step": 1})
+    save_checkpoint(folder / "checkpoint.pt", torch.load(folder / "checkpoint.pt", weights_only=True) | {"step": 1})
     said = answered(command, folder, "--output", tmp_path / "out.mp4")
     assert f"{folder.name} still trains: this is step 1 of 2" in said
 

@@ -161,8 +161,7 @@ def test_the_browsers_camera_becomes_the_view_of_the_same_camera(viewed: ViewedR
     camera = viewed.recording.cameras["train1"]
     q = quaternion_of_rotation(camera.T_camera_world[:3, :3].T)
     fov = 2 * np.arctan(camera.height / 2 / camera.K[1, 1])
-    wanted = Wanted((*camera.centre, *q, fov), 96 / 54, 0.0, "rgb", 0.0, False, 54)
-    seen = wanted.camera(96, 54)
+    seen = Wanted((*camera.centre, *q, fov), 96 / 54, 0.0, "rgb", 0.0, False, 54).camera(96, 54)
     assert np.allclose(seen.T_camera_world, camera.T_camera_world, atol=1e-9)
     assert np.allclose(np.diag(seen.K), np.diag(camera.K), rtol=1e-6)
 
@@ -180,8 +179,7 @@ def test_at_a_camera_the_recorded_image_and_the_error_are_shown_and_elsewhere_no
     assert np.array_equal(image, truth[:, 12:-12])
     page.controls["recorded"].value, page.controls["show"].value = 0.0, "error"
     draw(page, page.wanted(0.0)[0], None, None, Resolution())
-    error = client.scene.images[-1]
-    assert not np.array_equal(error, image)
+    assert not np.array_equal(client.scene.images[-1], image)
     client.camera.position = client.camera.position + 0.1
     wanted, _ = page.wanted(0.0)
     assert (wanted.standing, wanted.show, wanted.recorded) == (None, "rgb", 0.0)
@@ -222,8 +220,7 @@ def test_the_prior_as_points_lies_where_its_pixels_say(viewed: ViewedRun) -> Non
     pixels = (seen @ camera.K.T)[:, :2] / seen[:, 2:]
     inside = (seen[:, 2] > 0) & (pixels >= 0).all(1) & (pixels < (camera.width, camera.height)).all(1)
     truth = exact[tuple(np.floor(pixels[inside]).astype(int).T[::-1])]
-    off = np.abs(seen[inside, 2] / truth - 1)
-    assert np.median(off) < 0.1
+    assert np.median(np.abs(seen[inside, 2] / truth - 1)) < 0.1
 
 
 def test_play_goes_on_with_the_clock_and_begins_again(viewed: ViewedRun) -> None:

@@ -34,8 +34,7 @@ def room() -> Recording:
         turn = np.eye(4)
         turn[:2, :2] = [[np.cos(roll), -np.sin(roll)], [np.sin(roll), np.cos(roll)]]
         cameras[name] = replace(camera, T_camera_world=turn @ camera.T_camera_world)
-    source = replace(rendered.source, cameras=cameras)
-    return renamed(replace(rendered, cameras=cameras, source=source), NAMES)
+    return renamed(replace(rendered, cameras=cameras, source=replace(rendered.source, cameras=cameras)), NAMES)
 
 
 @pytest.fixture(scope="module")

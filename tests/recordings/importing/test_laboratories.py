@@ -56,8 +56,7 @@ def test_webcams_with_a_board_are_placed_in_metres(webcams: tuple, tmp_path: Pat
     folder, truth = webcams
     words = ["import", str(folder), "--intrinsics", str(lenses(tmp_path, truth)), "--board", "charuco:7x5:0.2:0.15"]
     words += ["--offsets", "auto", "--exposure", "false", "--images", "videos", "--output", str(tmp_path / "c")]
-    said = answered(*words)
-    assert "the board was seen by c0 in" in said
+    assert "the board was seen by c0 in" in answered(*words)
     found = {one.name: one.pinhole() for one in open_calibration(tmp_path / "c" / "calibration.json").cameras}
     degrees, share = worst(found, truth)
     assert degrees < 0.2

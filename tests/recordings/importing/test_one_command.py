@@ -120,8 +120,7 @@ def test_the_commands_and_a_stopped_import_goes_on(filmed: Filmed, tmp_path: Pat
         monkeypatch.setattr(f"d2_plugin.recordings.importing.{measured}", lambda *_: pytest.fail("found again"))
     assert main(words) == 0
     assert {path: path.read_bytes() for path in files} == {path: data for path, (data, _) in before.items()}
-    written = [path for path in files if path.suffix == ".png" and path.stat().st_mtime_ns != before[path][1]]
-    assert written == [lost]
+    assert [path for path in files if path.suffix == ".png" and path.stat().st_mtime_ns != before[path][1]] == [lost]
 
 
 def test_crop_and_scale_move_the_camera_with_the_image(filmed: Filmed, imported: Path, tmp_path: Path) -> None:
@@ -161,8 +160,7 @@ def words(filmed: Filmed, run: Path, *more: str) -> list[str]:
 def test_four_real_videos_become_a_scene(pose2sim: Callable[[int], Filmed], tmp_path: Path, capsys, answered) -> None:
     run = tmp_path / "run"
     command = words(pose2sim(4), run, "--import.offsets", "none", "--import.frames", "0:3:3", "--hooks", "none")
-    said = answered(*command, "--iterations", "20")
-    assert "8 images of 4 cameras" in said
+    assert "8 images of 4 cameras" in answered(*command, "--iterations", "20")
     metrics = json.loads((run / "metrics.json").read_text())
     assert metrics["test"] is None
     assert metrics["train"]["psnr"] > 8

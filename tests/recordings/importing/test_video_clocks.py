@@ -41,8 +41,7 @@ def test_what_is_no_timecode_counts_for_nothing(text: str) -> None:
 
 def heard(sound: np.ndarray, seed: int, loudness: float) -> Sound:
     """What a microphone of its own makes of a sound."""
-    noise = np.random.default_rng(seed).normal(0, 0.005, len(sound))
-    whole = loudness * sound + noise
+    whole = loudness * sound + np.random.default_rng(seed).normal(0, 0.005, len(sound))
     step = SOUND_RATE // RATE
     return Sound(whole[: len(whole) // step * step].reshape(-1, step).mean(1).astype(np.float32), 0.0)
 
@@ -52,8 +51,7 @@ def test_sound_finds_the_offset_within_a_tenth_of_a_frame(frames: float) -> None
     room, begin = room_sound(4.0), 0.5
     offset = frames / 30
     one = heard(room[round(begin * SOUND_RATE) :], 1, 0.8)
-    other = heard(room[round((begin + offset) * SOUND_RATE) :], 2, 0.2)
-    lag = lag_between(one, other)
+    lag = lag_between(one, heard(room[round((begin + offset) * SOUND_RATE) :], 2, 0.2))
     assert abs(lag.seconds - offset) * 30 < 0.1
     assert abs(lag.seconds - offset) < 5 * lag.error
 
@@ -95,8 +93,7 @@ def test_motion_finds_the_offset_within_two_of_its_errors_and_half_a_frame(
     seen = by_motion(filmed(recording, offsets, 0, recording.frames[::every]))
     for name, offset in offsets.items():
         assert not seen[name].doubt
-        off = abs(seen[name].seconds * recording.fps - offset)
-        assert off < min(0.5, 2 * seen[name].error * recording.fps)
+        assert abs(seen[name].seconds * recording.fps - offset) < min(0.5, 2 * seen[name].error * recording.fps)
 
 
 def test_motion_that_repeats_itself_is_doubted(shared_data: Callable[[str], Path]) -> None:
@@ -107,15 +104,13 @@ def test_motion_that_repeats_itself_is_doubted(shared_data: Callable[[str], Path
 
 
 def test_motion_of_another_event_is_doubted(shared_data: Callable[[str], Path]) -> None:
-    recording = open_recording(shared_data("studio"))
-    views = filmed(recording, dict.fromkeys(["02", "03", "04", "05"], 0.0), 0)
+    views = filmed(open_recording(shared_data("studio")), dict.fromkeys(["02", "03", "04", "05"], 0.0), 0)
     camera, images, times = views["03"]
     rng = np.random.default_rng(1)
     wall = rng.integers(0, 255, (180, 24)).astype(np.uint8)
     walks = [np.concatenate([images[0][:, :296], np.roll(wall, 3 * i, 0)], axis=1) for i in range(len(times))]
     views["03"] = camera, walks, times
-    seen = by_motion(views)
-    assert seen["03"].doubt
+    assert by_motion(views)["03"].doubt
 
 
 def test_what_motion_cannot_say_the_files_of_one_recorder_say() -> None:
@@ -167,8 +162,7 @@ def test_a_loop_that_does_not_close_is_refused() -> None:
 
 
 def test_given_offsets_are_in_frames_of_each_camera() -> None:
-    videos = {"a": a_video(25, None), "b": a_video(50, None)}
-    clocks = given_clock(videos, ("b=-7.5",))
+    clocks = given_clock({"a": a_video(25, None), "b": a_video(50, None)}, ("b=-7.5",))
     assert clocks["a"].seconds == 0
     assert clocks["b"].seconds == pytest.approx(-0.15)
 

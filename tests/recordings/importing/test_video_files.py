@@ -32,8 +32,7 @@ def images(count: int) -> list[np.ndarray]:
 @pytest.fixture(scope="module")
 def unsteady(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, np.ndarray]:
     """A video whose camera left out frames at times, and when each was shown."""
-    rng = np.random.default_rng(3)
-    times = np.cumsum(np.r_[0.0, rng.choice([1, 1, 1, 2], 39) / 30])
+    times = np.cumsum(np.r_[0.0, np.random.default_rng(3).choice([1, 1, 1, 2], 39) / 30])
     path = tmp_path_factory.mktemp("video") / "a.mp4"
     return write_video(path, images(40), list(times), turn=90, timecode="01:00:00:05"), times
 
@@ -115,8 +114,7 @@ def test_hdr_becomes_what_other_cameras_show(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("suffix", [".mp4", ".mov", ".mkv", ".mts", ".m2ts", ".avi"])
 def test_the_containers_of_cameras_are_read(suffix: str, tmp_path: Path) -> None:
-    path = write_video(tmp_path / f"a{suffix}", images(5), [i / 25 for i in range(5)])
-    assert len(read_video(path).stamps) == 5
+    assert len(read_video(write_video(tmp_path / f"a{suffix}", images(5), [i / 25 for i in range(5)])).stamps) == 5
 
 
 def wall(count: int, shift: int = 0, gain: float = 1.0) -> list[np.ndarray]:

@@ -48,8 +48,7 @@ def with_harmonics(count: int = 400, in_time: bool = False) -> SplatModel:
     plain, degree, generator = sharp_model("yang4d", count), 2 if in_time else 0, torch.Generator().manual_seed(3)
     rows = {name: value.detach() for name, value in plain.gaussians.parameters.items()}
     rows["harmonics"] = 0.2 * torch.randn(count, 16 * (degree + 1) - 1, 3, generator=generator)
-    chosen = Yang4DSettings(sh_degree=3, sh_time_degree=degree, background=in_time)
-    model = Yang4D(rows, chosen, 2.0, DURATION)
+    model = Yang4D(rows, Yang4DSettings(sh_degree=3, sh_time_degree=degree, background=in_time), 2.0, DURATION)
     if in_time:
         with torch.no_grad():
             model.background.harmonics.normal_(0, 0.2, generator=generator)
@@ -58,8 +57,7 @@ def with_harmonics(count: int = 400, in_time: bool = False) -> SplatModel:
 
 def larger(view: View) -> View:
     """The tiny view in images of 160 x 120, off centre so that the principal point matters."""
-    scale = torch.tensor([[WIDTH / view.width], [HEIGHT / view.height], [1.0]])
-    intrinsics = view.K * scale
+    intrinsics = view.K * torch.tensor([[WIDTH / view.width], [HEIGHT / view.height], [1.0]])
     intrinsics[:2, 2] += torch.tensor([5.0, -3.0])
     return View(view.camera, view.frame, view.time, view.T_camera_world, intrinsics, WIDTH, HEIGHT)
 

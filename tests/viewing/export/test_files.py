@@ -88,8 +88,7 @@ class TestThePage:
 
     def test_runs_of_two_recordings_are_not_compared(self, tmp_path: Path) -> None:
         scenes = [make_scene(sharp_model("yang4d", 50), "a", names) for names in (("l", "m", "r"), ("l", "m", "s"))]
-        says = "of different recordings: compare runs of one recording"
-        refuses(says, write_page, scenes, tmp_path / "scene.html")
+        refuses("of different recordings: compare runs of one recording", write_page, scenes, tmp_path / "scene.html")
 
     @pytest.mark.parametrize("backbone", ["yang4d", "deform"])
     def test_a_reader_finds_the_gaussians_within_a_hundredth_of_a_pixel(self, tmp_path: Path, backbone: str) -> None:
@@ -150,8 +149,7 @@ class TestOthersReadIt:
     @pytest.mark.parametrize("temporal", [True, False])
     def test_fourdgs_reads_the_moving_gaussians(self, tmp_path: Path, temporal: bool) -> None:
         fourdgs = pytest.importorskip("fourdgs", reason="fourdgs is in the `formats` extra")
-        model = with_harmonics(300) if temporal else sharp_model("yang4d", temporal=False)
-        scene = make_scene(model)
+        scene = make_scene(with_harmonics(300) if temporal else sharp_model("yang4d", temporal=False))
         [path], notes = write_export([scene], Export((Path(),), "4dgs"), tmp_path)
         assert "checks the file against its own error bounds" in notes[0]
         read = fourdgs.read(str(path)).gaussians
@@ -196,12 +194,11 @@ class TestOthersReadIt:
             positions, opacities = read.positions, read.opacities
         true = scene.still_at(scene.seconds[1])[0]
         kept = (true.opacities >= 1 / 255).nonzero()[:, 0]
+        places = true.positions[kept]
         assert len(positions) == len(kept)
         turns = torch.tensor([[1.0, 1, 1], [1, -1, -1], [-1, -1, 1]]).double()
-        apart = min(
-            (torch.cdist(true.positions[kept], positions * axes) for axes in turns), key=lambda d: d.amin(1).sum()
-        )
-        assert (apart.amin(1) * scene.pixels_per_unit(true.positions[kept])).quantile(0.95) < 0.5
+        apart = min((torch.cdist(places, positions * axes) for axes in turns), key=lambda d: d.amin(1).sum())
+        assert (apart.amin(1) * scene.pixels_per_unit(places)).quantile(0.95) < 0.5
         assert (true.opacities[kept] - opacities[apart.argmin(1)]).abs().quantile(0.9) < 0.01
 
     def test_without_the_converter_one_sentence_says_how_to_get_it(self, tmp_path: Path, monkeypatch) -> None:
@@ -214,8 +211,7 @@ class TestFewer:
     """`d2 export --keep`: what goes is what images would miss least."""
 
     def test_the_energy_of_a_gaussian_is_what_the_image_differs_by_without_it(self) -> None:
-        model = sharp_model("yang4d", 24)
-        viewed = make_scene(model).viewed
+        viewed = make_scene(sharp_model("yang4d", 24)).viewed
         view, generator = make_view(viewed.recording, "middle", 4), torch.Generator().manual_seed(0)
         energies = torch.zeros(24)
         for _ in range(100):
@@ -276,8 +272,7 @@ def test_a_viewer_reads_back_the_gaussians(tmp_path: Path, degree: int) -> None:
     rest = " ".join(f"f_rest_{i}" for i in range(3 * (degree + 1) ** 2 - 3))
     order = f"x y z nx ny nz f_dc_0 f_dc_1 f_dc_2 {rest} opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3"
     assert [line for line in header if "property" in line] == [f"property float {name}" for name in order.split()]
-    rotations = columns(read_ply(path), "rot")
-    torch.testing.assert_close(rotations.norm(dim=1), torch.ones(50))
+    torch.testing.assert_close(columns(read_ply(path), "rot").norm(dim=1), torch.ones(50))
     read = read_still_ply(path)
     assert torch.equal(read.positions, means.double())
     assert torch.equal(read.harmonics.coefficients, coefficients.double())
