@@ -117,6 +117,4 @@ class Deformable3DAdapter(InriaAdapter):
         self.gaussians.densification_postfix(*self._raw_rows(points))
 
     def _deformed(self, positions: Tensor, time: float) -> Tensor:
-        if not len(positions):
-            return positions
-        return self._moved(positions, self._own(self._offsets, positions, time)[0])
+        return self._moved(positions, self._own(self._offsets, positions, time)[0]) if len(positions) else positions

@@ -100,9 +100,11 @@ class FudanAdapter(InriaAdapter):
         return self._slice_rotated(view.time) if model.rot_4d else self._slice_unrotated(view.time)
 
     def colors(self, view: View, splats: Splats) -> Tensor:
-        """RGB [M, 3]; 4D spherical harmonics where the model has them (sh_utils.py:117)."""
+        """RGB [M, 3], seen along the ray to the unsliced centre; with cosines in time at the third degree alone
+        (forward.cu:71-175)."""
         model, time_degree = self.gaussians, int(optional(self.gaussians, "active_sh_degree_t", 0))
-        if not time_degree or model.gaussian_dim == 3 or optional(model, "force_sh_3d", False):
+        splats = splats._replace(means=model._xyz[splats.rows])
+        if not time_degree or model.gaussian_dim == 3 or model.active_sh_degree < 3 or model.force_sh_3d:
             return super().colors(view, splats)
         phase = (view.time - model._t[splats.rows, 0]) / (model.time_duration[1] - model.time_duration[0])
         return seen_colors(self._harmonics(), view, splats, int(model.active_sh_degree), phase, time_degree)

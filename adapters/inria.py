@@ -274,7 +274,6 @@ class InriaAdapter(Resizing, ABC):
 
     def _before_append(self, *_: Any, **__: Any) -> Report:
         count = len(self)
-
         return lambda: appended(count, len(self), self.gaussians._xyz.device)
 
     def _before_prune(self, mask: Tensor, *_: Any, **__: Any) -> Report:

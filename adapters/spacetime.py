@@ -103,15 +103,7 @@ class SpacetimeAdapter(InriaAdapter):
         widths = points.positions.new_full((count, 1), float(optional(model, "trbfslinit", 1.0)))
         if points.lifetimes is not None:
             widths = torch.minimum(widths, (points.lifetimes * math.sqrt(2)).log()[:, None])
-        model.densification_postfix(
-            rows.xyz,
-            points.colors.repeat(1, model._features_dc.shape[1] // 3),
-            rows.opacity,
-            rows.scaling,
-            rows.rotation,
-            points.times[:, None],
-            widths,
-            zeros(count, 9),
-            zeros(count, 4),
-            zeros(count, 3),
-        )
+        colors = points.colors.repeat(1, model._features_dc.shape[1] // 3)
+        still = points.times[:, None], widths, zeros(count, 9), zeros(count, 4)  # centre, width, motion, omega
+        shape = rows.opacity, rows.scaling, rows.rotation
+        model.densification_postfix(rows.xyz, colors, *shape, *still, zeros(count, 3))

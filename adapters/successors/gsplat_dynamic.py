@@ -116,10 +116,8 @@ class GsplatDynamicAdapter(GsplatAdapter):
 
     def _as_new(self, positions: Tensor, time: float) -> Tensor:
         """Where rows at these positions would be if all of them moved."""
-        if not len(positions):
-            return positions
         count, zeros = len(positions), positions.new_zeros
-        return self._moved(positions, zeros(count, 4), zeros(count, 1), time)[0]
+        return self._moved(positions, zeros(count, 4), zeros(count, 1), time)[0] if count else positions
 
     def _view_of_item(self, item: object) -> View:
         """An item of its data set: camtoworld, K, time and the image of one frame."""

@@ -18,6 +18,7 @@ import torch
 
 from d2_plugin.attach.session import AddGradient, Session, wrap_attribute
 from d2_plugin.errors import D2Error
+from d2_plugin.protocol import RasterSettings
 
 log = logging.getLogger(__name__)
 
@@ -111,6 +112,11 @@ class GsplatSession(Session):
         drawn = rasterization(*arguments, **named)
         if self.hooks is None or not (torch.is_grad_enabled() and drawn[0].requires_grad):
             return drawn
+        if named.get("camera_model", "pinhole") != "pinhole":
+            raise D2Error(f"D2 draws pinhole cameras alone, got camera_model '{named['camera_model']}': leave it out")
+        constants = {"near": named.get("near_plane", 0.01), "blur": named.get("eps2d", 0.3)}
+        antialiased = named.get("rasterize_mode") == "antialiased"
+        self.hooks.backbone.settings = RasterSettings(**constants, antialiased=antialiased)
         size = {"width": named["width"], "height": named["height"]}
         poses = torch.linalg.inv_ex(named["viewmats"].detach()).inverse
         term = self._term(self.hooks, [{"camtoworld": pose, "K": K, **size} for pose, K in zip(poses, named["Ks"])])

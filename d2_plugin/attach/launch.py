@@ -28,11 +28,15 @@ def main(arguments: Sequence[str]) -> int:
     try:
         options, command = parsed(arguments)
         session = prepare(options, command)
-        runpy.run_path(command[0], run_name="__main__")
+        try:
+            runpy.run_path(command[0], run_name="__main__")
+        except SystemExit as end:
+            if end.code:
+                raise
+        session.end()
     except D2Error as error:
         sys.stderr.write(f"d2: {error}\n")
         return 2
-    session.end()
     return 0
 
 
@@ -88,10 +92,8 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("repository", choices=sorted(RECIPES), help="which codebase the script belongs to")
     parser.add_argument("--d2", type=Path, default=None, help="configuration of D2; without it the bare trainer runs")
-    exported = "folder that d2 export-recording wrote, if the prior was built from its source"
-    parser.add_argument("--exported", type=Path, default=None, help=exported)
+    parser.add_argument("--exported", type=Path, help="what d2 export-recording wrote, if the prior is of its source")
     device = parser.add_mutually_exclusive_group()
     device.add_argument("--cpu", action="store_true", help="cuda means cpu, and D2's modules replace CUDA builds")
-    broken = "on a GPU, too, D2's modules replace CUDA builds that cannot be loaded"
-    device.add_argument("--stand-ins", action="store_true", help=broken)
+    device.add_argument("--stand-ins", action="store_true", help="on a GPU, too, they replace what cannot be loaded")
     return parser

@@ -205,11 +205,11 @@ def needed(script: Path, conditional: bool = True) -> dict[str, str]:
         seen.add(file)
         roots = (root, file.parent, *(folder for folder in file.parents if root in folder.parents))
         for name, line in _imports(file, conditional):
-            inside = next((place for base in roots for place in _inside(base, name)), None)
+            inside = next((place for base in roots for place in _inside(base, name.lstrip("."))), None)
             top = "tensorboard" if name.startswith("torch.utils.tensorboard") else name.split(".")[0]
             if inside is not None:
                 waiting.append(inside)
-            elif (top in STAND_INS or top not in standard) and not any((base / top).is_dir() for base in roots):
+            elif top and (top in STAND_INS or top not in standard) and not any((base / top).is_dir() for base in roots):
                 packages.setdefault(top, f"{file.relative_to(root)}:{line}")
     return packages
 
@@ -252,7 +252,7 @@ def _is_there(name: str) -> bool:
 
 
 def _imports(file: Path, conditional: bool) -> Iterator[tuple[str, int]]:
-    """Absolute names that a file imports when it is loaded, with lines; `from a import b` gives a.b and a."""
+    """Names that a file imports when it is loaded, with lines; `from .a import b` gives .a.b, which is no package."""
     source = read_bytes(file, SCRIPT, MOST_SCRIPT).decode(errors="replace")
     try:
         tree = ast.parse(source)
@@ -262,7 +262,7 @@ def _imports(file: Path, conditional: bool) -> Iterator[tuple[str, int]]:
         if isinstance(node, ast.Import):
             yield from ((alias.name, node.lineno) for alias in node.names)
         elif isinstance(node, ast.ImportFrom) and node.module:
-            yield from ((f"{node.module}.{alias.name}", node.lineno) for alias in node.names)
+            yield from ((f"{'.' * node.level}{node.module}.{alias.name}", node.lineno) for alias in node.names)
 
 
 def _at_once(node: ast.AST, conditional: bool) -> Iterator[ast.AST]:

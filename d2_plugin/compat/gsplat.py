@@ -23,9 +23,6 @@ from d2_plugin.errors import D2Error
 from d2_plugin.protocol import RasterSettings, Render, Splats, View
 from d2_plugin.rasterizer import rasterize
 
-ALPHA_MAX = 0.999
-"""gsplat's clamp of alpha, where Inria's is .99."""
-
 DEPTH_MODES = {"RGB": (True, None), "D": (False, "sum"), "ED": (False, "mean"), "RGB+D": (True, "sum")}
 DEPTH_MODES["RGB+ED"] = (True, "mean")
 """By render mode: whether there are colours, and which depth comes behind them."""
@@ -74,13 +71,12 @@ def rasterization(
         D2Error: something that this stand-in does not do.
     """
     _refuse(render_mode, camera_model, others)
-    settings = RasterSettings(
-        near=near_plane, blur=eps2d, alpha_max=ALPHA_MAX, antialiased=rasterize_mode == "antialiased"
-    )
+    settings = RasterSettings(near=near_plane, blur=eps2d, antialiased=rasterize_mode == "antialiased")
     covariances = covariances_of(scales, normalize(quats), 1.0)
     views = [View("", 0, 0.0, pose.detach(), K.detach(), width, height) for pose, K in zip(viewmats, Ks)]
-    parts = [_in_front(means, covariances, opacities, view, near_plane, far_plane) for view in views]
-    screen = _on_screen(parts, views, settings, len(means), radius_clip, packed)
+    gaussians = means, covariances, opacities, torch.arange(len(means), device=means.device)
+    parts = [_drawn(Splats(*gaussians), view, settings, far_plane, radius_clip) for view in views]
+    screen = _on_screen(parts, views, settings, len(means), packed)
     images, alphas = [], []
     for number, (splats, view) in enumerate(zip(parts, views)):
         shown = _colors(colors, sh_degree, means, view, number)[splats.rows]
@@ -103,11 +99,14 @@ def _refuse(render_mode: str, camera_model: str, others: dict[str, Any]) -> None
             raise D2Error(f"{name} of gsplat's rasterization needs its own kernels: leave it out, or build gsplat")
 
 
-def _in_front(means: Tensor, covariances: Tensor, opacities: Tensor, view: View, near: float, far: float) -> Splats:
+def _drawn(splats: Splats, view: View, settings: RasterSettings, far: float, radius_clip: float) -> Splats:
     forward = view.T_camera_world[2]
-    depths = means.detach() @ forward[:3] + forward[3]
-    rows = torch.nonzero((depths > near) & (depths < far)).squeeze(-1)
-    return Splats(means[rows], covariances[rows], opacities[rows], rows)
+    depths = splats.means.detach() @ forward[:3] + forward[3]
+    chosen = (depths > settings.near) & (depths < far)
+    if radius_clip > 0:
+        chosen &= screen_radii(splats, view, settings) > radius_clip
+    rows = torch.nonzero(chosen).squeeze(-1)
+    return Splats(*(field[rows] for field in splats))
 
 
 def _colors(colors: Tensor, sh_degree: int | None, means: Tensor, view: View, number: int) -> Tensor:
@@ -119,7 +118,7 @@ def _colors(colors: Tensor, sh_degree: int | None, means: Tensor, view: View, nu
 
 
 def _on_screen(
-    parts: list[Splats], views: list[View], settings: RasterSettings, count: int, radius_clip: float, packed: bool
+    parts: list[Splats], views: list[View], settings: RasterSettings, count: int, packed: bool
 ) -> dict[str, Any]:
     """What gsplat's strategies read: radii and centres, whose gradient is that of the offsets, in pixels."""
     like = parts[0].means
@@ -129,7 +128,6 @@ def _on_screen(
         for number, (splats, view) in enumerate(zip(parts, views)):
             radii[number, splats.rows] = screen_radii(splats, view, settings)[:, None].expand(-1, 2)
             centres[number, splats.rows] = _centres(splats.means, view)
-        radii[(radii <= radius_clip).all(-1)] = 0
     cameras = gaussians = None
     if packed:
         cameras, gaussians = torch.nonzero((radii > 0).all(-1), as_tuple=True)

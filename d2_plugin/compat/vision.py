@@ -20,10 +20,12 @@ from d2_plugin.gaussians.photometric import ssim
 
 
 def make_grid(tensor: Tensor | Sequence[Tensor], nrow: int = 8, padding: int = 2, **_: Any) -> Tensor:
-    """Images [B, C, H, W], or a list of [C, H, W], side by side on black, `nrow` to a row; [C, H', W']."""
+    """Images [B, C, H, W], or a list, side by side on black, `nrow` to a row; [C, H', W']. One stays as it is."""
     images = tensor if isinstance(tensor, Tensor) else torch.stack(list(tensor))
     if images.ndim < 4:
         images = images.reshape(1, -1, *images.shape[-2:])
+    if len(images) == 1:
+        return images[0]
     count, channels, height, width = images.shape
     columns = min(nrow, count)
     rows = math.ceil(count / columns)
@@ -38,9 +40,7 @@ def save_image(tensor: Tensor, fp: str | Path, **options: Any) -> None:
     """One image in 0..1, or a grid of several, as a file."""
     from PIL import Image
 
-    several = tensor.ndim == 4 and len(tensor) > 1
-    image = make_grid(tensor, **options) if several else tensor.reshape(-1, *tensor.shape[-2:])
-    values = (image.detach().cpu().clamp(0, 1) * 255 + 0.5).byte().permute(1, 2, 0).numpy()
+    values = (make_grid(tensor, **options).detach().cpu().clamp(0, 1) * 255 + 0.5).byte().permute(1, 2, 0).numpy()
     Image.fromarray(values[..., 0] if values.shape[-1] == 1 else np.ascontiguousarray(values)).save(fp)
 
 

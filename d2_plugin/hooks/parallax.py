@@ -84,7 +84,7 @@ class Parallax(ImageHook):
 
     def __init__(self, config: ParallaxConfig) -> None:
         super().__init__(config)
-        self._sights: dict[tuple[str, int, str, float, int], Sight] = {}
+        self._sights: dict[tuple[str, int, str, float], tuple[int, Sight]] = {}  # and of how many instants
         self._bytes = 0
         self._moving = MovingPixels()
 
@@ -116,9 +116,9 @@ class Parallax(ImageHook):
         ends = view, other
         # What moves is known better while instants are seen for the first time.
         instants = min(INSTANTS, *(len(context.instants(end.camera)) for end in ends))
-        key = view.camera, view.frame, other.camera, part, instants
-        sight = self._sights.get(key)
-        if sight is None:
+        key = view.camera, view.frame, other.camera, part
+        known, sight = self._sights.get(key, (0, None))
+        if sight is None or known != instants:
             sides = [Side(end, prior) for end in ends if (prior := context.prior(end)) is not None]
             moving = [life.isfinite() for end in ends if (life := self._moving.intervals(end, context)) is not None]
             if len(sides) < 2:
@@ -126,10 +126,10 @@ class Parallax(ImageHook):
             if len(moving) == 2:
                 sides = [side._replace(moving=pixels) for side, pixels in zip(sides, moving)]
             aside = on_the_way(view, other, part)
+            room = KEPT - self._bytes + (12 * len(sight[1]) if sight else 0)
             sight = aside, *in_sight(aside, *sides)
-            self._bytes += 12 * len(sight[1])
-            if self._bytes <= KEPT:
-                self._sights[key] = sight
+            if (size := 12 * len(sight[1])) <= room:
+                self._bytes, self._sights[key] = KEPT - room + size, (instants, sight)
         return sight
 
 

@@ -1,7 +1,6 @@
 """The traps of the official repositories, one by one: names, fields of view, batches, stages, probes, boxes."""
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -10,6 +9,7 @@ import torch
 from mimics import deformable3d, ex4dgs, fudan, hust4d, spacetime
 from mimics.inria import Camera, cameras_of, default_options
 from mimics.workplace import HOOKS, some_points
+from rasterizer_arguments import inria_camera
 from refusals import refuses
 from repositories import VARIANTS, fudan_model
 from tiny import TinyStore, make_views
@@ -24,6 +24,7 @@ from d2_plugin.adapters.hust4d import Hust4DAdapter
 from d2_plugin.adapters.keys import KeysByPose, PriorKey, frame_of_time, key_from_image_name, one_image_each
 from d2_plugin.adapters.spacetime import SpacetimeAdapter
 from d2_plugin.adapters.successors.fastergs4d import FasterGS4DAdapter
+from d2_plugin.compat import fourd
 from d2_plugin.config import DepthLossConfig
 from d2_plugin.protocol import Points
 
@@ -160,6 +161,20 @@ class TestFudan:
         del model.prefilter_var
         assert len(FudanAdapter(model).slice_at(make_views()[0]).rows) > 0
 
+    @pytest.mark.parametrize("degree", [2, 3])
+    def test_colours_are_those_of_the_cuda_source(self, degree: int) -> None:
+        """Seen along the ray to where a Gaussian is at its own time, and constant in time below the third degree."""
+        shs, view = torch.randn(60, 52, 3, generator=torch.Generator().manual_seed(0)), make_views()[4]
+        model, _ = fudan_model(active_sh_degree=degree, active_sh_degree_t=2, force_sh_3d=False)
+        model._features_dc, model._features_rest, turn = shs.split([1, 47, 4], 1)
+        model._rotation_r.data += 0.5 * turn[..., 0]  # so that they move
+        camera = inria_camera(view) | {"sh_degree": degree, "sh_degree_t": 2, "gaussian_dim": 4, "timestamp": view.time}
+        settings = fourd.GaussianRasterizationSettings(**camera, time_duration=model.time_duration[1])
+        splats = (adapter := FudanAdapter(model)).slice_at(view)
+        expected = fourd.GaussianRasterizer(settings)._colors(shs, model._xyz, model._t, splats.rows)
+        torch.testing.assert_close(adapter.colors(view, splats), expected)
+        assert not torch.allclose(splats.means, model._xyz[splats.rows], atol=0.1)
+
     def test_points_that_are_not_finite_are_never_inserted(self) -> None:
         model, _ = fudan_model()
         points = some_points(4)
@@ -198,27 +213,17 @@ class TestDeformations:
         refuses("stage must be one of coarse, fine, got 'medium'", Hust4DAdapter, model, scene, "medium")
 
 
-@pytest.mark.parametrize(
-    ("adapter", "model", "needed"),
-    [
-        (FudanAdapter, SimpleNamespace(_xyz=torch.zeros(3, 3)), "no densification_postfix, which FudanAdapter"),
-        (FasterGS4DAdapter, SimpleNamespace(_spatial_means=torch.zeros(1, 3)), "no prune, which FasterGS4DAdapter"),
-    ],
-)
-def test_another_codebase_than_the_adapters_is_refused(adapter: type, model: object, needed: str) -> None:
-    refuses(f"SimpleNamespace has {needed} needs", adapter, model)
+def test_another_codebase_than_the_adapters_is_refused() -> None:
+    model = SimpleNamespace(_xyz=torch.zeros(3, 3), _spatial_means=torch.zeros(1, 3))
+    refuses("SimpleNamespace has no densification_postfix, which FudanAdapter needs", FudanAdapter, model)
+    refuses("SimpleNamespace has no prune, which FasterGS4DAdapter needs", FasterGS4DAdapter, model)
 
 
-@pytest.mark.parametrize(
-    ("make", "sentence"),
-    [
-        (lambda: FudanAdapter(fudan.make()[0], key=lambda camera: PriorKey("a", 0)), "has no world_view_transform"),
-        (lambda: VARIANTS["gsplat"]().adapter, "is no View"),
-        (lambda: VARIANTS["fastergs4d"]().adapter, "has no perspective `camera`"),
-    ],
-)
-def test_what_is_no_camera_of_the_codebase_is_refused(make: Callable, sentence: str) -> None:
-    refuses(f"a camera of type dict {sentence}", make().view, {})
+def test_what_is_no_camera_of_the_codebase_is_refused() -> None:
+    keyed = FudanAdapter(fudan.make()[0], key=lambda camera: PriorKey("a", 0))
+    refuses("a camera of type dict has no world_view_transform", keyed.view, {})
+    refuses("a camera of type dict is no View", VARIANTS["gsplat"]().adapter.view, {})
+    refuses("a camera of type dict has no perspective `camera`", VARIANTS["fastergs4d"]().adapter.view, {})
 
 
 def test_points_inside_spacetime_have_its_own_start() -> None:
@@ -227,8 +232,7 @@ def test_points_inside_spacetime_have_its_own_start() -> None:
     SpacetimeAdapter(model, 2).insert(Points(*(value for value in some_points(2))))
     assert model._trbf_center[-1].item() == 0.5
     assert model._trbf_scale[-1].item() == pytest.approx(model.trbfslinit)
-    torch.testing.assert_close(model._features_dc[-2:, :3], some_points(2).colors)
-    torch.testing.assert_close(model._features_dc[-2:, 3:], some_points(2).colors)
+    torch.testing.assert_close(model._features_dc[-2:], some_points(2).colors.repeat(1, 2))
 
 
 @pytest.mark.parametrize("name", ["fudan", "spacetime"])

@@ -69,7 +69,8 @@ class Runner:
             colors, alphas, info = rasterization(
                 means=p["means"], quats=p["quats"], scales=p["scales"].exp(), opacities=torch.sigmoid(p["opacities"]),
                 colors=torch.cat([p["sh0"], p["shN"]], 1), viewmats=view.T_camera_world[None], Ks=view.K[None],
-                width=view.width, height=view.height, sh_degree=1, packed=False)
+                width=view.width, height=view.height, sh_degree=1, packed=False,
+                near_plane=0.02, rasterize_mode="antialiased")
             info["means2d"].retain_grad()
             (colors[0] - self.frames.image(index)).abs().mean().backward()
             for optimizer in self.optimizers.values():
@@ -133,6 +134,9 @@ def test_hooks_insert_remove_and_pull_on_depth_and_the_scripts_own_growth_is_sai
     attached, session = trained(HOOKS)
     assert session.hooks.log.inserted > 0
     assert len(attached["means"]) == len(session.hooks.backbone)
+    assert session.hooks.backbone.settings == RasterSettings(near=0.02, antialiased=True)
+    image = torch.zeros(1, requires_grad=True)
+    refuses("pinhole cameras alone, got .*'fisheye'", session._drawing, lambda **_: [image], camera_model="fisheye")
     assert {entry.hook for entry in session.hooks.trace} == {"densify", "prune", "depth_loss"}
     said = re.findall(r"the trainer's own densification has made (\d+) Gaussians beside the (\d+)", caplog.text)
     assert len(said) == 1, caplog.text
@@ -175,9 +179,8 @@ class TestViewsByPose:
     def test_a_pose_of_two_images_or_of_none_is_refused(self) -> None:
         view = make_views()[0]
         item = {"camtoworld": torch.linalg.inv(view.T_camera_world), "K": view.K, "width": 32, "height": 24}
-        twice = SimpleNamespace(
-            camtoworlds=np.repeat(self.PARSER.camtoworlds[:1], 2, 0), image_names=["cam0_0000.png", "cam0_0001.png"]
-        )
+        poses = np.repeat(self.PARSER.camtoworlds[:1], 2, 0)
+        twice = SimpleNamespace(camtoworlds=poses, image_names=["cam0_0000.png", "cam0_0001.png"])
         refuses("2 images have the pose of this view", ViewsByPose(twice), item)
         item["camtoworld"] = item["camtoworld"] + 0.5
         refuses("0 images have the pose of this view", ViewsByPose(self.PARSER), item)
@@ -198,14 +201,15 @@ class TestRasterization:
 
     def test_it_draws_what_the_reference_draws(self, given: tuple[dict, object]) -> None:
         named, view = given
-        image, alpha, _ = stand_in.rasterization(**named, render_mode="RGB+D", packed=False)
-        adapter = GsplatAdapter(
-            {"means": named["means"], "scales": named["scales"].log(), "quats": named["quats"],
-             "opacities": torch.logit(named["opacities"])}, {},
-        )  # fmt: skip
-        splats = adapter.slice_at(view)
-        settings = RasterSettings(near=0.01, alpha_max=stand_in.ALPHA_MAX)
-        expected = reference.rasterize(splats, named["colors"], view, settings)
+        image, alpha, meta = stand_in.rasterization(**named, render_mode="RGB+D", packed=False)
+        small = float(meta["radii"].float().median())
+        clipped, _, meta = stand_in.rasterization(**named, packed=False, radius_clip=small)
+        assert meta["radii"][meta["radii"] > 0].min() > small
+        alone = {k: v[meta["radii"][0, :, 0] > 0] for k, v in named.items() if torch.is_tensor(v) and len(v) == 40}
+        torch.testing.assert_close(clipped, stand_in.rasterization(**named | alone)[0])
+        raw = {"means": named["means"], "quats": named["quats"], "scales": named["scales"].log()}
+        splats = GsplatAdapter(raw | {"opacities": torch.logit(named["opacities"])}, {}).slice_at(view)
+        expected = reference.rasterize(splats, named["colors"], view, RasterSettings(near=0.01))
         torch.testing.assert_close(image[0, ..., :3], expected.color, atol=2e-5, rtol=1e-4)
         torch.testing.assert_close(image[0, ..., 3], expected.depth_sum, atol=2e-4, rtol=1e-4)
         torch.testing.assert_close(alpha[0, ..., 0], expected.alpha, atol=2e-5, rtol=1e-4)
@@ -213,11 +217,10 @@ class TestRasterization:
 
     def test_centres_get_the_gradient_in_pixels_packed_or_not(self, given: tuple[dict, object]) -> None:
         named, view = given
-        full, packed = ({**named, "packed": flag} for flag in (False, True))
         target = torch.rand(1, view.height, view.width, 3, generator=torch.Generator().manual_seed(5))
         found = []
-        for arguments in (full, packed):
-            image, _, meta = stand_in.rasterization(**arguments)
+        for packed in (False, True):
+            image, _, meta = stand_in.rasterization(**named, packed=packed)
             meta["means2d"].retain_grad()
             (image - target).square().sum().backward()
             found.append(meta)

@@ -4,8 +4,10 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -109,11 +111,8 @@ def test_stages_of_4dgaussians_reach_the_adapter() -> None:
     gaussians, scene = hust4d.make()
     session.objects.model, session.objects.scene = gaussians, scene
     session.hooks = D2Hooks(DEPTH_LOSS, Hust4DAdapter(gaussians, scene, "coarse"), TinyStore())
-
-    def render(camera: object, model: object, stage: str) -> dict:
-        return {"render": gaussians._xyz.sum() * torch.ones(3, 2, 2)}
-
-    session._rendering(render, scene.getTrainCameras()[0], gaussians, stage="fine")
+    drawn = {"render": gaussians._xyz.sum() * torch.ones(3, 2, 2)}
+    session._rendering(lambda *_, stage: drawn, scene.getTrainCameras()[0], gaussians, stage="fine")
     assert session.hooks.backbone.stage == "fine"
     assert session.hooks.backbone.active(1)
 
@@ -144,10 +143,8 @@ class TestOriginals:
     def test_ours_takes_the_place_of_what_cannot_where_it_may_and_says_why(self, tmp_path: Path, caplog) -> None:
         (tmp_path / "built.py").write_text("raise RuntimeError('no nvcc')\n")
         wanted = Original(f"{self.NAME}.part", STAND_IN, "built.py")
-        installed, absent = (
-            Original(f"{self.NAME}._C", STAND_IN),
-            Original(f"{self.NAME}.absent", STAND_IN, "absent.py"),
-        )
+        installed = Original(f"{self.NAME}._C", STAND_IN)
+        absent = Original(f"{self.NAME}.absent", STAND_IN, "absent.py")
         provide((wanted, installed, absent), tmp_path, on_cpu=False, replace_broken=True)
         assert sys.modules[f"{self.NAME}.part"].distCUDA2(torch.rand(0, 3)).shape == (0,)
         exec(f"from {self.NAME}._C import distCUDA2")
@@ -195,6 +192,15 @@ class TestCommand:
         assert "put the repository's train.py and its arguments after --" in capsys.readouterr().err
         assert main(["fudan", "--", str(tmp_path / "train.py")]) == 2
         assert "no script at" in capsys.readouterr().err
+
+    @pytest.mark.parametrize(("code", "ends"), [("0", [True]), ("None", [True]), ("3", [])])
+    def test_a_script_that_exits_is_ended_like_any_other(self, tmp_path: Path, monkeypatch, code, ends) -> None:
+        ended: list[bool] = []
+        monkeypatch.setattr(launch, "prepare", lambda *_: SimpleNamespace(end=lambda: ended.append(True)))
+        (tmp_path / "train.py").write_text(f"import sys\nsys.exit({code})")
+        with nullcontext() if ends else pytest.raises(SystemExit):
+            assert main(["fudan", "--", str(tmp_path / "train.py")]) == 0
+        assert ended == ends
 
     def test_without_a_gpu_the_cpu_has_to_be_asked_for(self, tmp_path: Path, monkeypatch, capsys) -> None:
         monkeypatch.setattr(launch.torch.cuda, "is_available", lambda: False)

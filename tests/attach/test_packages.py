@@ -23,7 +23,7 @@ def script(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (inner / "scene").mkdir(parents=True)
     (inner / "scene" / "__init__.py").write_text("from utils.tools import thing\nimport absent_one.part as p\n")
     (inner / "utils").mkdir()
-    (inner / "utils" / "tools.py").write_text("import numpy, os.path\nfrom absent_two import *\n")
+    (inner / "utils" / "tools.py").write_text("import numpy, os.path\nfrom absent_two import *\nfrom ._C import x\n")
     waiting = "def later():\n    import absent_inside\ntry:\n    import absent_tried\nexcept ImportError:\n    pass\n"
     (tmp_path / "train.py").write_text(f"import torch\nfrom thirdparty.splatting.scene import Scene\n{waiting}")
     before = list(sys.meta_path)
@@ -35,7 +35,7 @@ def script(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_what_a_script_needs_is_read_from_the_files_it_reaches(script: Path) -> None:
     packages = needed(script)
-    assert set(packages) == {"torch", "numpy", "absent_one", "absent_two"}
+    assert set(packages) == {"torch", "numpy", "absent_one", "absent_two"}  # what lies beside a file is no package
     assert packages["absent_two"] == "thirdparty/splatting/utils/tools.py:2"
     assert set(missing(script, {"absent_one.part"})) == {"absent_two"}
 

@@ -231,6 +231,9 @@ MIRROR = torch.diag(torch.tensor([1.0, -1, 1, 1]))
         (last_only, "rendered_depth knows the last render alone"),
         (swaps_a_batch, "the render of one camera of a batch for another"),
         (with_insert(refuses), "insert: the backbone raised RuntimeError: no room"),
+        (with_insert(lambda p: p.select(torch.arange(0))), "insert adds none of 8 points"),
+        (with_report(lambda index: index.flip(0) if len(index) == 69 else index), "own densification the means of"),
+        (with_report(lambda index: index + 60 * (len(index) == 69)), "own densification reports rows outside -1..77"),
     ],
 )
 def test_each_violation_gets_its_sentence(change: Callable[[WatchedModel], None], sentence: str) -> None:

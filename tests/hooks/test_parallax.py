@@ -38,8 +38,7 @@ def seen_columns(own: DepthPrior, other: DepthPrior, row: int = 0) -> list[int]:
 
 def context_of(adapter: object, views: list[View], store: object | None = None, step: int = 4) -> Context:
     """Of a loss for the left view, once the given ones were trained on."""
-    loader = PriorLoader(store or TinyStore())
-    generator = torch.Generator().manual_seed(0)
+    loader, generator = PriorLoader(store or TinyStore()), torch.Generator().manual_seed(0)
     return Context(step, adapter, [LEFT], loader, generator, beside=lambda view: views)
 
 
@@ -66,9 +65,8 @@ def turned(degrees: float, x: float) -> View:
 def test_the_way_leads_from_one_camera_to_the_other() -> None:
     start, end = turned(0, -0.4), turned(90, 0.8)
     for part, angle, x in ((0, 0, -0.4), (0.5, 45, 0.2), (1, 90, 0.8)):
-        torch.testing.assert_close(
-            on_the_way(start, end, part).T_camera_world, turned(angle, x).T_camera_world, atol=1e-6, rtol=0
-        )
+        pose = on_the_way(start, end, part).T_camera_world
+        torch.testing.assert_close(pose, turned(angle, x).T_camera_world, atol=1e-6, rtol=0)
     assert on_the_way(LEFT, RIGHT, 0.5).camera == LEFT.camera  # its colours are those that this camera sees
 
 
@@ -158,9 +156,7 @@ def test_the_size_of_the_world_and_its_origin_do_not_matter(size: float, away: f
 
 
 def test_views_in_float64_are_as_good() -> None:
-    left, right = (
-        replace(view, K=view.K.double(), T_camera_world=view.T_camera_world.double()) for view in (LEFT, RIGHT)
-    )
+    left, right = (replace(v, K=v.K.double(), T_camera_world=v.T_camera_world.double()) for v in (LEFT, RIGHT))
     adapter, context = make_adapter(make_model()), context_of(make_adapter(make_model()), [LEFT, RIGHT])
     doubled = replace(context, views=[left], beside=lambda view: [left, right], backbone=adapter)
     losses = [Parallax(ParallaxConfig()).loss(one) for one in (context, doubled)]
@@ -244,6 +240,8 @@ def test_what_is_in_sight_follows_from_the_instants_that_are_known_and_not_from_
     later, anew = hook.loss(context(5)), Parallax(ParallaxConfig()).loss(context(5))
     assert torch.equal(later, anew)
     assert not torch.equal(first, later)
+    (sight,) = hook._sights.values()  # of three instants nothing is kept any more, and nothing counts
+    assert hook._bytes == 12 * len(sight[1][1])
 
 
 LEFT_ALONE = SimpleNamespace(prior=lambda camera, *frame: prior_of(LEFT) if camera == LEFT.camera else None)
