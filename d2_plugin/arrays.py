@@ -25,11 +25,7 @@ NUMBERS = "biuf"
 
 
 def read_array(
-    path: Path | str,
-    remedy: str = RESTORE,
-    *,
-    key: str | None = None,
-    most: int = MOST_BYTES,
+    path: Path | str, remedy: str = RESTORE, *, key: str | None = None, most: int = MOST_BYTES
 ) -> np.ndarray:
     """The numbers of a .npy file, or of the member `key` of an .npz file.
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import importlib
+import importlib.util
 import signal
 import sys
 import threading
 import zlib  # noqa: F401  before pycolmap, whose own copy of zlib would otherwise be bound and crash later calls
+from contextlib import suppress
 from types import ModuleType
 
 from d2_plugin.errors import missing_extra
@@ -36,10 +37,16 @@ def imported(name: str, package: str, extra: str, purpose: str) -> ModuleType:
     Raises:
         MissingExtra: where it is not installed; the sentence names `extra`, the extra of this package that brings it.
     """
-    try:
-        return importlib.import_module(name)
-    except ImportError:
-        raise missing_extra(package, extra, purpose) from None
+    with suppress(ImportError):
+        module = importlib.import_module(name)
+        if getattr(module, "__file__", None) or not hasattr(module, "__path__"):  # see `is_installed`
+            return module
+    raise missing_extra(package, extra, purpose)
+
+
+def is_installed(name: str) -> bool:
+    """Whether there is such a module; a mere folder of its name, which Python would import as well, is none."""
+    return getattr(importlib.util.find_spec(name), "origin", None) is not None
 
 
 def import_av(purpose: str) -> ModuleType:

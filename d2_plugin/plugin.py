@@ -86,11 +86,7 @@ class D2Hooks:
     """
 
     def __init__(
-        self,
-        config: D2Config,
-        backbone: Backbone,
-        store: Store | None = None,
-        hooks: Mapping[str, Hook] | None = None,
+        self, config: D2Config, backbone: Backbone, store: Store | None = None, hooks: Mapping[str, Hook] | None = None
     ) -> None:
         """The silent form of `from_config`, which documents the arguments."""
         check_backbone(backbone)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import importlib.util
 import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, Protocol
+
+from d2_plugin.extras import is_installed
 
 
 def show(*lines: str) -> None:
@@ -69,7 +70,7 @@ def progress_bar(title: str, total: int) -> Iterator[Bar]:
     if _silent:
         yield _Nothing()
         return
-    if importlib.util.find_spec("rich") is None or not sys.stderr.isatty():
+    if not sys.stderr.isatty() or not is_installed("rich"):
         yield _Lines(title, total)
         return
     from rich.console import Console

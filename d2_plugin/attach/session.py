@@ -123,11 +123,7 @@ class Session:
     """
 
     def __init__(
-        self,
-        recipe: Recipe,
-        config: D2Config | Path | None,
-        store: Store | None = None,
-        exported: Path | None = None,
+        self, recipe: Recipe, config: D2Config | Path | None, store: Store | None = None, exported: Path | None = None
     ) -> None:
         """A configuration in a file gets its schedules once the trainer says how long it runs; None: a bare run."""
         self.recipe, self.config, self.store, self.exported = recipe, config, store, exported

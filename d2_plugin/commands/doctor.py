@@ -6,10 +6,10 @@ With --attach REPOSITORY PATH: what that trainer imports and this environment la
 from __future__ import annotations
 
 import importlib.metadata
-import importlib.util
 import os
 import platform
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -17,6 +17,7 @@ from typing import Annotated
 from d2_plugin import __version__, compiler, registry
 from d2_plugin.compiler import prebuilt
 from d2_plugin.errors import D2Error
+from d2_plugin.extras import is_installed
 from d2_plugin.settings import Positional, Settings
 
 OPTIONAL = {
@@ -87,6 +88,8 @@ def _compiler() -> str:
 
 
 def _state(names: Sequence[str], module: str, extra: str, purpose: str) -> str:
-    if importlib.util.find_spec(module) is None:
+    if not is_installed(module):
         return f"missing, needed for {purpose}: run `pip install 'd2-4dgs[{extra}]'`"
-    return f"{importlib.metadata.version(names[0])} ({purpose})"
+    with suppress(importlib.metadata.PackageNotFoundError):
+        return f"{importlib.metadata.version(names[0])} ({purpose})"
+    return f"of unknown version ({purpose})"

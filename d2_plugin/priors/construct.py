@@ -90,10 +90,7 @@ def compares_cameras(settings: PriorSettings, cameras: int, measured: bool) -> b
 
 
 def construct(
-    views: Mapping[str, ViewSources],
-    cameras: Mapping[str, Camera],
-    settings: PriorSettings,
-    kind: MonoKind | None,
+    views: Mapping[str, ViewSources], cameras: Mapping[str, Camera], settings: PriorSettings, kind: MonoKind | None
 ) -> dict[str, ViewPrior]:
     """D* of synchronized views, by camera.
 

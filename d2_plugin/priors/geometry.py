@@ -90,6 +90,12 @@ def _view_pair(ours: _Known, theirs: _Known) -> ViewPair:
     return pair
 
 
+def same_spot(first: Camera, second: Camera) -> bool:
+    """Whether two cameras stand on the same spot, up to rounding: they see no parallax."""
+    baseline = np.linalg.norm(first.centre - second.centre)
+    return bool(baseline <= 1e-9 * np.linalg.norm([first.centre, second.centre]))
+
+
 def pixel_grid(camera: Camera, dtype: type = np.float32) -> tuple[np.ndarray, np.ndarray]:
     """Index coordinates u [1, W] and v [H, 1], to be broadcast."""
     return np.arange(camera.width, dtype=dtype)[None, :], np.arange(camera.height, dtype=dtype)[:, None]
@@ -106,8 +112,9 @@ def viewing_rays(camera: Camera, dtype: type = np.float32) -> np.ndarray:
 
 def triangulation_angle(camera: Camera, pair: ViewPair, depth: np.ndarray) -> np.ndarray:
     """Angle [H, W] in radians between the rays of both cameras at each pixel's 3D point; 0 for one centre."""
-    points = viewing_rays(camera) * depth[..., None]
-    other = points - pair.direction.astype(np.float32)
+    unit = 2.0 ** -np.frexp(np.median(depth))[1]  # near 1 no square overflows, and a power of two changes no digit
+    points = viewing_rays(camera) * (depth * np.float32(unit))[..., None]
+    other = points - (pair.direction * unit).astype(np.float32)
     (x, y, z), (u, v, w) = np.moveaxis(points, -1, 0), np.moveaxis(other, -1, 0)
     cross = np.sqrt((y * w - z * v) ** 2 + (z * u - x * w) ** 2 + (x * v - y * u) ** 2)
     # atan2 of (|a x b|, a.b) keeps its digits at small angles, where arccos of float32 has none below .03 degrees.

@@ -11,7 +11,7 @@ two definitions.
 
 from __future__ import annotations
 
-import importlib.util
+import importlib
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -21,6 +21,7 @@ import torch
 from torch import Tensor
 
 from d2_plugin.errors import D2Error
+from d2_plugin.extras import is_installed
 
 UNIFORM_WINDOW = 7
 GAUSSIAN_WINDOW = 11
@@ -96,7 +97,7 @@ def ssim_3dgs(image: Tensor, truth: Tensor) -> float:
 def flip(image: Tensor, truth: Tensor) -> float | None:
     """FLIP of Andersson et al. 2020, 0..1, 0 for equal images: what an eye sees that flips from one to the other on a
     screen of 67 pixels per degree. By NVIDIA's package flip-evaluator; None where it is not installed."""
-    if importlib.util.find_spec("flip_evaluator") is None:
+    if not is_installed("flip_evaluator"):
         return None
     package = importlib.import_module("flip_evaluator")
     first, second = (np.ascontiguousarray(part.transpose(1, 2, 0), np.float32) for part in _pair(truth, image))

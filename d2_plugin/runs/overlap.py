@@ -99,10 +99,7 @@ def measure_texture(recording: Recording, cameras: Sequence[str]) -> tuple[float
 
 
 def _depths(
-    camera: Camera,
-    cameras: Sequence[Camera],
-    depth_range: tuple[float, float] | None,
-    points: np.ndarray | None,
+    camera: Camera, cameras: Sequence[Camera], depth_range: tuple[float, float] | None, points: np.ndarray | None
 ) -> np.ndarray | None:
     """Depths [D] at which the things in a camera's image lie, or None if they are unknown."""
     if depth_range is None and points is not None:

@@ -10,6 +10,7 @@ import numpy as np
 
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.depth_on_disk import SensorDepth, find_depth_on_disk
+from d2_plugin.priors.geometry import same_spot
 from d2_plugin.priors.multiview.source import multiview_about
 from d2_plugin.priors.settings import PriorSettings
 from d2_plugin.priors.stereo.settings import NO_MATCHER
@@ -112,10 +113,7 @@ class ScenePlan:
 
 
 def plan_scene(
-    recording: Recording,
-    cameras: Sequence[str],
-    mono_source: str | None,
-    settings: PriorSettings | None = None,
+    recording: Recording, cameras: Sequence[str], mono_source: str | None, settings: PriorSettings | None = None
 ) -> ScenePlan:
     """Decide for `recording` trained with `cameras`.
 
@@ -162,7 +160,7 @@ def _stereo(recording: Recording, cameras: Sequence[str], settings: PriorSetting
     if settings.stereo.matcher == NO_MATCHER:
         return Decision("stereo", False, "the settings of the priors say so", "the settings of the priors rule it out")
     calibrations = [recording.cameras[name] for name in cameras]
-    if np.ptp(np.stack([camera.centre for camera in calibrations]), axis=0).max() == 0:
+    if all(same_spot(calibrations[0], camera) for camera in calibrations):
         return Decision("stereo", False, "all training cameras stand at one point", "it takes cameras that stand apart")
     # The sparse points of a recording that is a COLMAP model tell the depths.
     model = find_model(recording.path) if recording.path is not None and recording.layout == "colmap" else None

@@ -14,6 +14,7 @@ from d2_plugin.priors.settings import PriorSettings
 from d2_plugin.recordings import Recording, open_recording
 from d2_plugin.recordings.cameras.check import check_background_weight, check_recording
 from d2_plugin.recordings.checks.memory import check_memory
+from d2_plugin.runs.metrics import GAUSSIAN_WINDOW
 from d2_plugin.runs.plan import ScenePlan, appearance_decision, plan_scene
 from d2_plugin.runs.settings import RunSettings, hooks_in_use, prior_settings
 from d2_plugin.runs.start import TimedPoints, TrainingFrames, begin_with_exposures, initial_points, scene_extent
@@ -56,6 +57,12 @@ class Scene:
         )
         recording, between = _without_held_out_instants(recording, settings.hold_out_instants)
         train, test = _split(recording, settings)
+        for name in (*train, *test):
+            if min(size := (recording.cameras[name].width, recording.cameras[name].height)) < GAUSSIAN_WINDOW:
+                raise D2Error(
+                    f"camera {name} has {size[0]}x{size[1]} pixels and scores need {GAUSSIAN_WINDOW} each way: give a "
+                    "smaller --downscale or larger images"
+                )
         check_memory(recording, train)
         check_background_weight(recording, train, settings.background_weight)
         notes = (*recording.notes, *check_recording(recording, (*train, *test), scored=test))

@@ -11,7 +11,9 @@ from typing import Any
 
 from d2_plugin.durable import Kind, make_folder, read_table, write_table
 from d2_plugin.errors import D2Error
+from d2_plugin.priors.frame import view_digest
 from d2_plugin.priors.summary import PriorSummary
+from d2_plugin.recordings import open_recording
 from d2_plugin.runs.prior.build import build_priors_for
 from d2_plugin.runs.prior.trials import can_decide, tried
 from d2_plugin.runs.scene import Scene
@@ -50,13 +52,16 @@ class Shared:
 
 
 def share_points(settings: RunSettings, folder: Path) -> Path:
-    """Triangulate where `folder` has no points.npz yet; returns its path. Those of other frames are refused."""
-    points, of = folder / "points.npz", {name: settings.as_table()[name] for name in OF}
+    """Triangulate where `folder` has no points.npz yet; returns its path. Those of other images are refused."""
+    points, of = folder / "points.npz", {name: check(settings).as_table()[name] for name in OF}
+    camera = settings.train_cameras[0]
+    seen = open_recording(settings.recording, cameras=[camera], frames=settings.frames, downscale=settings.downscale)
+    of["recording"] = view_digest(seen, camera, seen.frames[-1])
     if not _record(points).is_file():
         scene = Scene.open(check(settings))
         _timed(points, lambda: triangulated_points(scene.recording, scene.train_cameras).save(points), of=of)
     elif other := [name for name, kept in read_table(_record(points), COST).get("of", of).items() if kept != of[name]]:
-        raise D2Error(f"{folder} holds points and priors for other {', '.join(other)}: give another --output")
+        raise D2Error(f"{folder} holds points and priors of another {', '.join(other)}: give another --output")
     return points
 
 

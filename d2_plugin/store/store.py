@@ -213,7 +213,7 @@ class PriorStore:
             table = read_table(self.path / "trials.json", TRIALS)
         except FileNotFoundError:
             return None
-        return table if table["contents"] == self.contents else None
+        return table if table.pop("contents") == self.contents else None
 
     def camera(self, camera: str, frame: int) -> CameraRecord | None:
         """The camera that one prior was built for; None where the store has none or does not say."""
@@ -228,12 +228,7 @@ class PriorStore:
         return self.entries.find_current(camera, frame, key) is not None
 
     def write(
-        self,
-        camera: str,
-        frame: int,
-        prior: FusedPrior,
-        record: dict[str, Any],
-        entries: EntryFolder | None = None,
+        self, camera: str, frame: int, prior: FusedPrior, record: dict[str, Any], entries: EntryFolder | None = None
     ) -> None:
         """Store all maps of one prior and its record, among the priors or among `between`.
 

@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 from oracles.export_files import ReadPage
 from prior_cases import contents
+from refusals import refuses
 
 from d2_plugin.commands.cli import main
+from d2_plugin.extras import imported
 from d2_plugin.recordings import open_recording
 from d2_plugin.recordings.export import folder as folder_layout
 from d2_plugin.recordings.export.folder import save_recording
@@ -49,31 +51,24 @@ def test_a_run_leaves_scores_images_configuration_and_checkpoint(finished: Path)
     assert metrics["test"]["psnr"] > 10
     assert 0 < metrics["test"]["depth_absrel"] < 1
     assert metrics["test"]["lpips"] is None
-    assert metrics["train_cameras"] == CAMERAS.split(",")
-    assert metrics["test_cameras"] == ["test0"]
-    assert metrics["hooks"] == ["prior", "densify", "prune", "depth_loss", "motion", "parallax"]
-    assert metrics["iterations"] == 40
+    said = {"train_cameras": CAMERAS.split(","), "test_cameras": ["test0"], "iterations": 40, "mono_emulated": True}
+    said["hooks"] = ["prior", "densify", "prune", "depth_loss", "motion", "parallax"]
+    assert said.items() <= metrics.items()
     assert metrics["gaussians"] > 100
     assert set(metrics["seconds"]) == {"priors", "train", "eval"}
     assert metrics["plan"]["temporal"]["use"] is True
-    assert metrics["mono_emulated"] is True
-    assert len(metrics["per_view"]) == 2
-    assert len(list((finished / "images").glob("test0_*.png"))) == 2
-    assert (finished / "d2.toml").is_file()
-    assert (finished / "checkpoint.pt").is_file()
+    assert len(metrics["per_view"]) == len(list((finished / "images").glob("test0_*.png"))) == 2
+    assert {"d2.toml", "checkpoint.pt"} <= {path.name for path in finished.iterdir()}
 
 
 def test_evaluating_again_gives_the_same_scores(finished: Path) -> None:
     before = json.loads((finished / "metrics.json").read_text())
     assert main(["eval", str(finished), "--no-images"]) == 0
     after = json.loads((finished / "metrics.json").read_text())
-    assert after["test"] == before["test"]
-    assert after["per_view"] == before["per_view"]
+    assert (after["test"], after["per_view"]) == (before["test"], before["per_view"])
 
 
-def test_priors_are_built_in_parts_and_shown_on_a_sheet(
-    recording: Path, finished: Path, tmp_path, capsys, answered
-) -> None:
+def test_priors_are_built_in_parts_and_shown_on_a_sheet(recording, finished, tmp_path, capsys, answered) -> None:
     build = ["priors", str(recording), "--train-cameras", CAMERAS, "--output", str(tmp_path)]
     assert main([*build, "--shard", "2/2"]) == 0
     assert not (tmp_path / "contact_sheet.png").exists()
@@ -108,9 +103,7 @@ def test_a_part_that_cannot_be_built_is_refused(recording: Path, tmp_path, refus
     assert says in refused(*build, *shard.split())
 
 
-def test_compare_tabulates_what_was_measured_and_keeps_runs_of_one_name_apart(
-    finished: Path, tmp_path, answered
-) -> None:
+def test_compare_tabulates_what_was_measured_and_keeps_runs_of_one_name_apart(finished, tmp_path, answered) -> None:
     other = shutil.copytree(finished, tmp_path / finished.name)
     lines = answered("compare", str(finished), str(other)).splitlines()
     header, _, *rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines]
@@ -126,10 +119,8 @@ def test_plan_names_each_decision_with_its_measurement(recording: Path, capsys: 
     assert main(["plan", str(recording), "--train-cameras", CAMERAS]) == 0
     notes, lines = [], []
     first, *rest = capsys.readouterr().out.splitlines()
-    assert first == (
-        "recording  room: layout folder, 4 cameras (train0, train1, train2, test0), frames 0 to 1 (2) "
-        "at 12 per second, 96x54 pixels"
-    )
+    cameras = "4 cameras (train0, train1, train2, test0)"
+    assert first == f"recording  room: layout folder, {cameras}, frames 0 to 1 (2) at 12 per second, 96x54 pixels"
     for line in rest:
         (notes if line.split()[0] == "note" else lines).append(line)
     assert notes, "what is known about the recording is said"
@@ -149,6 +140,15 @@ def test_the_doctor_of_a_recording_names_the_plan(recording: Path, refused: Refu
     assert f"d2 plan {recording}" in refused("doctor", recording)
 
 
+def test_a_folder_named_like_a_missing_package_is_none(tmp_path: Path, monkeypatch, answered) -> None:
+    (tmp_path / "nobodys").mkdir()
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr("d2_plugin.commands.doctor.OPTIONAL", {"nobodys": ("view", "x"), "refusals": ("view", "y")})
+    assert "nobodys     missing, needed for x" in (report := answered("doctor"))
+    assert "refusals    of unknown version (y)" in report
+    refuses("x needs N", imported, "nobodys", "N", "view", "x")
+
+
 def test_one_instant_leaves_the_temporal_dimension_out_and_all_cameras_may_train(recording: Path, tmp_path) -> None:
     run = tmp_path / "still"
     assert train(recording, run, "--frames", "1:1", "--hooks", "none", "--train-cameras", f"{CAMERAS},test0") == 0
@@ -162,11 +162,10 @@ def test_one_instant_leaves_the_temporal_dimension_out_and_all_cameras_may_train
 
 
 def test_an_output_folder_of_another_run_or_with_other_files_is_left_alone(
-    recording: Path, finished: Path, tmp_path: Path, refused: Refused
+    recording, finished, tmp_path, refused
 ) -> None:
     before = contents(finished)
-    message = refused(*words(recording, finished, "--seed", "5"))
-    assert "holds another run, made with other settings of seed" in message
+    assert "holds another run, made with other settings of seed" in refused(*words(recording, finished, "--seed", "5"))
     assert contents(finished) == before
     (tmp_path / "notes.txt").write_text("mine")
     assert "is not empty and holds no run" in refused(*words(recording, tmp_path))

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from prior_cases import camera_at
 
 from d2_plugin.priors.build import build_priors
 from d2_plugin.priors.monocular.across import Shown, aligned_across, is_open
@@ -148,6 +149,14 @@ class TestStiff:
         found = aligned_across(views | {first: anchored(views[first], 0 * views[first].geometric)}, "relative")
         assert set(found) == set(views) - {first}
 
+    def test_a_depth_map_that_is_negative_at_its_anchors_has_no_slopes_to_try(self) -> None:
+        floor = np.linspace(8, 2, 90, dtype=np.float32)[:, None].repeat(160, 1)  # the same from side to side
+        known = floor * ((np.indices(floor.shape)[0] // 6 == 7) & (np.arange(160) < 60))
+        found = align(floor - 20, known, kind="metric", settings=ALIGN)
+        cameras = [camera_at((x, 0, 0), size=(160, 90)) for x in (0, 0.3, 0.6)]
+        views = {str(n): Shown(camera, floor - 20, known, found) for n, camera in enumerate(cameras)}
+        assert aligned_across(views, "metric") == {}
+
     @pytest.mark.parametrize("value", [np.nan, 0.0])
     def test_pixels_without_a_prediction_are_asked_nothing(self, room: Recording, value: float) -> None:
         def half(name: str, mono: np.ndarray) -> np.ndarray:
@@ -173,9 +182,8 @@ def test_two_cameras_far_apart_outdoors(shared_data: Callable[[str], Path], tmp_
         prior = PriorSettings(depth_range=(15.0, 40.0), align=AlignSettings(across=across))
         build_priors(recording, ["02", "05"], tmp_path, prior)
         for camera in ("02", "05"):
-            found = PriorStore.open(tmp_path).prior(camera, 10)
-            known, truth = found.depth.numpy() > 0, recording.depth(camera, 10)
-            known &= truth > 0
+            found, truth = PriorStore.open(tmp_path).prior(camera, 10), recording.depth(camera, 10)
+            known = (found.depth.numpy() > 0) & (truth > 0)
             apart = np.abs(found.depth.numpy() / np.where(known, truth, 1) - 1)[known]
             errors[across, camera] = float(np.median(apart)), known.mean()
             if across:

@@ -204,6 +204,7 @@ CASES = {
     "depth from 1e-3 to 1e6": (((FROM_1E_3_TO_1E6 - 0.5) / 2 * (1 + 0.01 * NORMAL), FROM_1E_3_TO_1E6), OK),
     "200,000 anchors": (line(200_000), OK),
     "zero residual": (line(noise=0.0), OK),
+    "one value of a million": ((np.r_[UNIFORM, 1e6], np.r_[UNIFORM, 3]), OK),
     "unrelated": ((NORMAL, UNIFORM), AlignStatus.UNSTABLE),
     "three leverage points": ((np.r_[np.ones(500), [1.5] * 3], np.r_[4 + 0.01 * NORMAL, [5] * 3]), AlignStatus.FLAT),
 }

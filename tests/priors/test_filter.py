@@ -88,13 +88,13 @@ def test_nan_and_negative_depths_are_no_depths(recording: Recording) -> None:
 
 def test_more_confirmations_can_be_asked_for(recording: Recording) -> None:
     grays, cameras, depths, costs = views(recording)
-    kept = []
-    for needed in (1, 2, 3):
-        chosen = replace(SETTINGS, min_sources=needed)
-        kept.append(filter_depths(grays, cameras, depths, costs, chosen)[1].depth.astype(bool).mean())
+    asked = [replace(SETTINGS, min_sources=needed) for needed in (1, 2, 3)]
+    kept = [filter_depths(grays, cameras, depths, costs, one)[1].depth.astype(bool).mean() for one in asked]
     assert kept[0] > kept[1] > 0
     assert kept[2] == kept[1]  # there are only two other views
     assert set(np.unique(confirm(1, cameras, depths, SETTINGS).sources)) == {0, 1, 2}
+    crowd = ([one[1], *[one[0]] * 256] for one in (cameras, depths))
+    assert set(np.unique(confirm(0, *crowd, SETTINGS).sources)) == {0, 256}
 
 
 def test_texture_is_the_spread_of_grey_values_in_a_window() -> None:

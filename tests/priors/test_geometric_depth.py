@@ -35,8 +35,7 @@ def matched(pair: Recording) -> list[GeometricDepth]:
 
 
 def run(recording: Recording, bounds: tuple[float, float], settings: StereoSettings = SETTINGS) -> list[GeometricDepth]:
-    names = list(recording.cameras)
-    images = [recording.image(name, 0) for name in names]
+    images = [recording.image(name, 0) for name in recording.cameras]
     return geometric_depth(images, list(recording.cameras.values()), bounds, settings)
 
 
@@ -100,8 +99,7 @@ def test_the_depth_range_comes_from_points_then_the_data_set_then_the_baselines(
     assert "triangulated" in measured.origin
     declared = depth_bounds([replace(camera, near_far=(2.0, 10.0)) for camera in cameras])
     assert declared[:2] == pytest.approx((1.6, 12.0))
-    few = points[:60]  # on one thing, at 3 to 3.2
-    wide = depth_bounds([replace(camera, near_far=None) for camera in cameras], few)
+    wide = depth_bounds([replace(camera, near_far=None) for camera in cameras], points[:60])  # of one thing, 3 to 3.2
     truth = np.concatenate([pair.depth(name, 0).ravel() for name in pair.cameras])
     assert wide.near < truth.min()
     assert wide.far > truth.max()
@@ -134,6 +132,8 @@ def test_points_behind_the_camera_do_not_count_and_cameras_at_one_point_have_no_
     behind = cameras[0].centre + backwards + np.random.default_rng(0).normal(0, 0.1, (200, 3))
     assert "triangulated" not in depth_bounds(cameras, behind).origin
     refuses("stand at one point", depth_bounds, [replace(cameras[0], near_far=None)] * 2)
+    turning = [camera_at((0.3, 0.7, -1.1), turn, size=(64, 48)) for turn in (0, 0.15, -0.2)]  # apart by rounding
+    refuses("stand at one point", depth_bounds, turning)
 
 
 BOUNDS = (2.0, 9.0)

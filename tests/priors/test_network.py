@@ -44,6 +44,8 @@ def test_a_network_of_free_size_gets_depth_anything_v2s_lower_bound(tmp_path: Pa
     assert model.input_size(1014, 1352) == (518, 686)  # short side 518, both multiples of 14
     assert model.input_size(640, 362) == (910, 518)
     assert model.input_size(180, 320) == (518, 924)
+    low = MonocularModel(tiny_onnx.mean_network(tmp_path / "low.onnx", 56, "width"), "relative")
+    assert low.input_size(60, 80) == (56, 70)  # as high as it must be, and no wider than that makes it
     tensor = model.prepare(SMOOTH)
     assert tensor.shape == (1, 3, 518, 686)
     restored = tensor[0].transpose(1, 2, 0) * IMAGENET_STD + IMAGENET_MEAN
@@ -70,6 +72,7 @@ def test_enlarging_aligns_the_corners_as_torch_does() -> None:
     np.testing.assert_allclose(upsample(small, 50, 33), reference[0, 0].numpy(), atol=1e-5)
     np.testing.assert_array_equal(upsample(small, 7, 9), small)
     np.testing.assert_array_equal(upsample(small[:1, :1], 4, 5), np.full((4, 5), small[0, 0]))
+    assert (upsample(np.full((2, 3), np.inf), 4, 5) == np.inf).all()  # a sky
 
 
 def test_the_fingerprint_changes_with_file_and_preprocessing(tmp_path: Path) -> None:
@@ -90,6 +93,7 @@ def test_the_fingerprint_changes_with_file_and_preprocessing(tmp_path: Path) -> 
         ({}, {"kind": "inverse"}, "unknown monocular kind 'inverse'"),
         ({}, {"preprocessing": "imagenet"}, "unknown preprocessing 'imagenet'"),
         ({"channels": 4}, {}, r"export a network whose input is \[1, 3, H, W\]"),
+        ({"channels": "h", "height": "w", "width": 3}, {}, r"takes \[1, 'h', 'w', 3\]: export a network whose"),
         ({"batch": 4}, {}, "takes 4 images at once: export it with a batch of 1"),
         ({"height": 200_000}, {}, "takes images of 80x200000, expected at most 8192 a side"),
         ({"outputs": 2}, {}, r"returns \(1, 2, 60, 80\): expected one map"),

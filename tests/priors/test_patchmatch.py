@@ -48,10 +48,8 @@ def raw(rig: Rig, settings: StereoSettings = SETTINGS, **more: object) -> Maps:
 
 def share_within(result: Maps, rig: Rig, error: float) -> float:
     """Share of the co-visible pixels whose unfiltered depth is within `error` of the truth."""
-    right = [
-        (np.abs(depth - truth) < error * truth)[seen]
-        for (depth, _), truth, seen in zip(result, rig.truths, rig.covisible)
-    ]
+    known = zip(result, rig.truths, rig.covisible)
+    right = [(np.abs(depth - truth) < error * truth)[seen] for (depth, _), truth, seen in known]
     return float(np.concatenate(right).mean())
 
 
@@ -133,7 +131,7 @@ def test_only_good_planes_are_handed_over_the_best_of_them_and_none_seen_edge_on
     assert not handed_over(empty, [seen_plane(theirs, across, across @ ours.centre, 0.1)]).any()
 
 
-@pytest.mark.parametrize("scale", [1e-3, 1e4])
+@pytest.mark.parametrize("scale", [1e-15, 1e-3, 1e4, 1e12])
 def test_the_unit_of_length_does_not_matter(rig: Rig, native: Maps, scale: float) -> None:
     (near, far), metres = rig.depth_range, native[0][0]
     cameras = [moved(camera, scale) for camera in rig.cameras]
@@ -178,6 +176,13 @@ def test_sources_at_a_good_angle_come_first_and_useless_ones_not_at_all() -> Non
     cameras = [camera_at((x, 0, 0), turn, size=(160, 90), focal=140) for x, turn in places]
     assert choose_sources(0, cameras, (3.0, 5.0), SETTINGS) == [3, 4, 2]
     assert choose_sources(0, cameras, (3.0, 5.0), replace(SETTINGS, patchmatch_sources=1)) == [3]
+
+
+def test_what_none_of_32_sources_matches_is_no_perfect_match() -> None:
+    cameras = [camera_at((0.1 * i, 0.05 * (i % 3), 0), size=(40, 30)) for i in range(33)]
+    noise = list(np.random.default_rng(0).integers(0, 256, (33, 30, 40), dtype=np.uint8))
+    found = patchmatch(noise, cameras, (2, 8), StereoSettings(patchmatch_sources=32))
+    assert np.mean([cost == 0 for _, cost in found]) < 1e-3
 
 
 def test_images_may_differ_in_size(rig: Rig) -> None:

@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 from at_once import measured_at_once
 from refusals import refuses
+from stand_in_recordings import write_grey
 
 from d2_plugin.commands.cli import main
 from d2_plugin.runs.ablation.ablate import order_table, report, table
@@ -107,4 +108,6 @@ def test_the_command_trains_shares_priors_and_repeats_nothing(saved_room, tmp_pa
         assert main(command) == 0
     assert {path: path.stat().st_mtime_ns for path in checkpoints} == checkpoints
     assert "another run" in refused(*command, "--iterations", "9")
-    assert "for other frames: give another --output" in refused(*command, "--rows", "no_rgbd", "--frames", "0")
+    for path in (room / "images" / "train0").iterdir():
+        write_grey(path, 99, (96, 54))  # another recording in a folder of the same name
+    assert "of another frames, recording: give" in refused(*command, "--rows", "no_rgbd", "--frames", "0")

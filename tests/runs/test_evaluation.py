@@ -91,6 +91,7 @@ def test_every_second_instant_trains_and_those_after_the_last_are_left_out(tmp_p
         assert all(scene.scored.seconds(frame) == room.seconds(frame) for frame in scene.scored.frames)
     with pytest.raises(D2Error, match="leaves one of 5 instants: give a smaller number"):
         Scene.open(RunSettings(folder, ("train0", "train1"), hold_out_instants=5))
+    refuses("16x9 pixels and scores need 11", Scene.open, RunSettings(folder, ("train0", "train1"), downscale=3))
 
 
 def test_flicker_is_the_error_of_change_and_belongs_to_one_camera(recording: Recording) -> None:

@@ -64,9 +64,7 @@ def test_depth_is_emulated_where_no_network_takes_the_place_of_emulated_maps(mov
 @pytest.mark.parametrize(
     ("iterations", "tables", "built"), [(199, {}, False), (200, {}, True), (199, {"motion": {}}, True)]
 )
-def test_flow_is_built_where_the_run_is_long_enough_to_use_it_or_its_user_says_so(
-    moving, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, iterations: int, tables: dict, built: bool
-) -> None:
+def test_long_runs_and_users_who_say_so_get_flow(moving, tmp_path, monkeypatch, iterations, tables, built) -> None:
     def stop(*_: object, between: bool) -> None:
         raise D2Error(f"between: {between}")
 

@@ -9,18 +9,21 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
+from at_once import measured_at_once
 from hypothesis import given
 from hypothesis import strategies as st
 from refusals import refuses
 
+from d2_plugin.durable import CannotWrite
 from d2_plugin.runs.ablation.presets import PRESETS
 from d2_plugin.runs.rows import TRY, Row, make_row
 from d2_plugin.runs.settings import RunSettings
 from d2_plugin.runs.shared import Shared
 from d2_plugin.runs.training import bench as timed
-from d2_plugin.runs.training.measured import Work, fingerprint, follow
+from d2_plugin.runs.training.measured import Work, fingerprint, follow, measure
 
 SETTINGS = RunSettings("room", ("a", "b"))
 
@@ -105,6 +108,11 @@ class TestPlan:
         assert job(elsewhere) == job(replace(SETTINGS, recording="room", priors="dual"))
         others = [replace(SETTINGS, seed=1), replace(SETTINGS, iterations=5), replace(SETTINGS, downscale=2)]
         assert len({job(SETTINGS), *map(job, others), job(SETTINGS, name="a"), job(SETTINGS, name="a", weight=2)}) == 6
+
+
+def test_a_full_disk_is_no_result() -> None:
+    with measured_at_once():
+        refuses("full", measure, Mock(run=Mock(side_effect=CannotWrite("full"))))
 
 
 PARENT = """

@@ -69,9 +69,7 @@ def test_ssim_at_left_out_cameras_decides_and_one_line_says_so() -> None:
     ("behind", "declared", "choice"),
     [(0.003, 0.05, "all"), (0.006, 0.05, "stereo"), (0.003, 0.08, "stereo"), (0.003, math.nan, "stereo")],
 )
-def test_where_images_are_as_good_small_declared_errors_add_surfaces(
-    behind: float, declared: float, choice: str
-) -> None:
+def test_where_images_are_as_good_small_declared_errors_add_surfaces(behind, declared, choice) -> None:
     tie = Trials({"a": GOOD - behind}, {"a": GOOD}, declared, 1.0)
     assert tie.choice == choice
     assert ("has more surfaces" in str(tie)) is (choice == "all")
@@ -103,9 +101,7 @@ def stored(folder: Path, recording: Recording, wrong: float) -> Path:
 
 
 @pytest.mark.parametrize(("wrong", "choice"), [(0.0, "all"), (0.5, "stereo")])
-def test_depth_is_believed_if_it_is_right_whatever_its_sigma(
-    room: Path, tmp_path: Path, wrong: float, choice: str
-) -> None:
+def test_depth_is_believed_if_it_is_right_whatever_its_sigma(room, tmp_path, wrong: float, choice: str) -> None:
     settings = RunSettings(str(room), TRAINED)
     scene = Run(settings, tmp_path / "run").scene
     store = PriorStore.open(stored(tmp_path / "priors", scene.recording, wrong))
@@ -171,9 +167,7 @@ def test_the_user_may_choose_and_then_nothing_is_tried(settings, tmp_path, tried
         ("all", {"priors": {"variant": "mvs"}}, True),
     ],
 )
-def test_parallax_is_left_out_where_other_depth_fills_the_gaps(
-    settings, tmp_path, monkeypatch, choice, tables, on
-) -> None:
+def test_other_depth_fills_the_gaps_without_parallax(settings, tmp_path, monkeypatch, choice, tables, on) -> None:
     run = run_of(replace(settings, overrides=tables), tmp_path / "run")
     run.trials = {"choice": choice}
     monkeypatch.setattr("d2_plugin.runs.run.D2Hooks", lambda config, *_, **__: config)
@@ -209,6 +203,7 @@ def test_a_run_that_is_scored_again_still_says_what_was_tried(settings, tmp_path
     run_of(settings, tmp_path / "longer").prepare()
     short = replace(settings, iterations=3)
     run_of(short, tmp_path / "run").train()
+    assert "contents" not in PriorStore.open(tmp_path / "priors").tried()
     (tmp_path / "priors" / "trials.json").unlink()
     assert Run(short, tmp_path / "run").evaluate(images=False)["trials"]["choice"] == "stereo"
     assert D2Config.from_toml(tmp_path / "run" / "d2.toml").believe == "stereo"

@@ -23,6 +23,7 @@ import numpy as np
 
 from d2_plugin.errors import D2Error
 from d2_plugin.extras import import_pycolmap
+from d2_plugin.priors.geometry import same_spot
 from d2_plugin.reading import said
 from d2_plugin.recordings.cameras.calibrating.features import as_colmap
 from d2_plugin.recordings.cameras.epipolar import sampson
@@ -113,11 +114,8 @@ def triangulate(images: Sequence[np.ndarray], cameras: Sequence[Camera], frame: 
 def triangulate_frames(recording: Recording, cameras: Sequence[str], frames: Iterable[int]) -> SparsePoints:
     """`triangulate` for each of `frames` of a recording, joined; images are read one instant at a time."""
     calibrations = [recording.cameras[name] for name in cameras]
-    parts = []
-    for frame in frames:
-        images = [recording.image(name, frame) for name in cameras]
-        parts.append(triangulate(images, calibrations, frame))
-    return SparsePoints.joined(parts)
+    instants = ((frame, [recording.image(name, frame) for name in cameras]) for frame in frames)
+    return SparsePoints.joined(triangulate(images, calibrations, frame) for frame, images in instants)
 
 
 @contextmanager
@@ -147,10 +145,9 @@ def _extract(pycolmap: ModuleType, image: np.ndarray) -> Features:
 
 def _matched_pairs(features: Sequence[Features], cameras: Sequence[Camera]) -> dict[tuple[int, int], np.ndarray]:
     """Matches [M, 2] of every pair of images that has any."""
-    pairs = {}
-    for i, j in itertools.combinations(range(len(cameras)), 2):
-        if not same_spot(cameras[i], cameras[j]):
-            pairs[i, j] = epipolar_matches(features[i], features[j], cameras[i], cameras[j])
+    both = itertools.combinations(range(len(cameras)), 2)
+    apart = [(i, j) for i, j in both if not same_spot(cameras[i], cameras[j])]
+    pairs = {(i, j): epipolar_matches(features[i], features[j], cameras[i], cameras[j]) for i, j in apart}
     return {pair: matches for pair, matches in pairs.items() if len(matches)}
 
 
@@ -179,12 +176,6 @@ def _nearest(queries: np.ndarray, candidates: np.ndarray, block: int = 1024) -> 
         clear = (angle <= MAX_ANGLE) & (angle <= MAX_RATIO * second)
         nearest[start : start + block] = np.where(clear, best, -1)
     return nearest
-
-
-def same_spot(first: Camera, second: Camera) -> bool:
-    """Whether two cameras stand on the same spot, up to rounding: they see no parallax."""
-    baseline = np.linalg.norm(first.centre - second.centre)
-    return bool(baseline <= 1e-9 * max(1.0, np.abs(first.centre).max()))
 
 
 def _triangulated(
@@ -249,11 +240,8 @@ def _collected(model: Any, images: Sequence[np.ndarray], frame: int) -> SparsePo
     if not points:
         return SparsePoints.empty()
     colors = [np.mean([_color(model, images, seen) for seen in point.track.elements], axis=0) for point in points]
-    return SparsePoints(
-        positions=np.array([point.xyz for point in points], np.float64),
-        colors=np.array(colors, np.float32) / 255,
-        frames=np.full(len(points), frame, np.int64),
-    )
+    positions = np.array([point.xyz for point in points], np.float64)
+    return SparsePoints(positions, np.array(colors, np.float32) / 255, np.full(len(points), frame, np.int64))
 
 
 def _color(model: Any, images: Sequence[np.ndarray], seen: Any) -> np.ndarray:

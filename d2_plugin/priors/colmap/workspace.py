@@ -17,7 +17,7 @@ from typing import ClassVar
 import numpy as np
 
 from d2_plugin.errors import D2Error
-from d2_plugin.priors.geometry import relative_pose
+from d2_plugin.priors.geometry import relative_pose, same_spot
 from d2_plugin.priors.stereo.settings import StereoSettings
 from d2_plugin.reading import read_bytes
 from d2_plugin.recordings.cameras.formats.colmap import ColmapImage, ColmapModel, read_model
@@ -236,12 +236,12 @@ def scale_of_world(cameras: Sequence[Camera], poses: dict[str, np.ndarray], fold
         poses: T_camera_world [4, 4] in the workspace's world, by name.
 
     Raises:
-        D2Error: the poses differ by more than a similarity, or a single camera's by anything at all.
+        D2Error: the poses differ by more than a similarity, or those of one point by anything at all.
     """
-    if len(cameras) == 1:
-        if np.allclose(cameras[0].T_camera_world, poses[cameras[0].name], atol=1e-4):
+    if all(same_spot(cameras[0], camera) for camera in cameras):
+        if all(np.allclose(camera.T_camera_world, poses[camera.name], atol=1e-4) for camera in cameras):
             return 1.0
-        raise _other_poses(folder, "one camera in another world, whose scale cannot be known")
+        raise _other_poses(folder, "they stand at one point in another world, whose scale cannot be known")
     ours, theirs = [], []
     for first, second in itertools.combinations(cameras, 2):
         here = relative_pose(first, second)

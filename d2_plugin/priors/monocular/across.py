@@ -82,11 +82,8 @@ def aligned_across(views: Mapping[str, Shown], kind: MonoKind) -> dict[str, Alig
         fits = {name: _agreement(name, maps, lines) for name in maps}
         worst = min(wanted, key=lambda name: fits[name].matched)
         if fits[worst].matched >= MATCHED:
-            alignments = {
-                name: replace(views[name].alignment, across=fit.spread)
-                for name, fit in fits.items()
-                if fit.matched >= MATCHED
-            }
+            spreads = {name: fit.spread for name, fit in fits.items() if fit.matched >= MATCHED}
+            alignments = {name: replace(views[name].alignment, across=spread) for name, spread in spreads.items()}
             shared = {name: _through(alignments[name], views[name], lines[name], kind) for name in wanted}
             return alignments | shared
         wanted.remove(worst)
@@ -100,8 +97,8 @@ def is_open(view: Shown) -> bool:
         return False
     known = predicted(view.mono)
     anchors = view.mono[known & (view.geometric > 0)]
-    if not anchors.size:
-        return False
+    if not anchors.size or (view.alignment.kind == "metric" and not np.median(anchors) > 0):
+        return False  # the slopes of a depth map are tried in units of the line from the origin to its anchors
     first, last = (float(np.quantile(anchors, share)) for share in MOST)
     if last - first > SPAN * (np.fmax.reduce(view.mono, axis=None) - np.fmin.reduce(view.mono, axis=None)):
         return False  # nearly always, and spares the quantiles of the whole map

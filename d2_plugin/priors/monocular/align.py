@@ -221,6 +221,8 @@ def _fitted(mono: np.ndarray, geometric: np.ndarray, kind: MonoKind, settings: A
         return Alignment(AlignStatus.TOO_FEW, kind, anchors=count)
     rows = anchors[_subsample(count)]
     x, depth = (values.ravel()[rows].astype(np.float64) for values in (mono, geometric))
+    near = np.abs(x - np.median(x)) <= 1e5 * _central_range(x)  # a value beyond is no prediction
+    x, depth = x[near], depth[near]
     if _central_range(x) <= 1e-6 * np.abs(x).max():
         return Alignment(AlignStatus.FLAT, kind, anchors=count)
     if _central_range(depth) <= MIN_SPREAD * float(np.median(depth)):

@@ -13,7 +13,7 @@ from d2_plugin.priors.settings import PriorSettings
 from d2_plugin.recordings.recording import MonoKind, Recording
 from d2_plugin.store.files import EntryFolder, hash_of
 
-MONO_VERSION = 1  # raise it when prediction changes what it returns, so that caches are not trusted
+MONO_VERSION = 2  # raise it when prediction changes what it returns, so that caches are not trusted
 
 
 class MapsOnDisk:

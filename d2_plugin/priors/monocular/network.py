@@ -60,7 +60,8 @@ class NetworkInput:
             raise D2Error(f"{path} has {len(inputs)} inputs: export a network with one image input {layout}")
         whole, dtypes = inputs[0].shape, {"tensor(float)": np.float32, "tensor(float16)": np.float16}
         shape = whole[1:] if views is not None and len(whole) == 5 else whole
-        if len(shape) != 4 or (shape[1] not in (3, None) and isinstance(shape[1], int)):
+        # Channels come last where three pixels are all that a row would have.
+        if len(shape) != 4 or (shape[1] not in (3, None) and isinstance(shape[1], int)) or shape[3] == 3 != shape[1]:
             raise D2Error(f"{path} takes {shown(whole)}: export a network whose input is {layout}")
         if views is not None and isinstance(shape[0], int) and shape[0] != views:
             raise D2Error(
@@ -146,11 +147,11 @@ class MonocularModel:
 
     def input_size(self, height: int, width: int) -> tuple[int, int]:
         """Height and width that an image of this size is resized to: the network's own, or 518 on the short side."""
-        if self.input.height and self.input.width:
-            return self.input.height, self.input.width
-        enlarge = SHORT_SIDE / min(height, width)
-        rows = self.input.height or _multiple_of_patch(height * enlarge)
-        columns = self.input.width or _multiple_of_patch(width * enlarge)
+        rows, columns = self.input.height, self.input.width
+        if rows and columns:
+            return rows, columns
+        enlarge = rows / height if rows else columns / width if columns else SHORT_SIDE / min(height, width)
+        rows, columns = rows or _multiple_of_patch(height * enlarge), columns or _multiple_of_patch(width * enlarge)
         if max(rows, columns) > LARGEST_INPUT:
             raise D2Error(
                 f"an image of {width}x{height} would enter {self.path} as {columns}x{rows}, at most {LARGEST_INPUT} a "
@@ -205,10 +206,11 @@ def upsample(prediction: np.ndarray, height: int, width: int) -> np.ndarray:
     columns, column_share = _aligned(prediction.shape[1], width)
     source = prediction.astype(np.float32)
     upper, lower = source[rows], source[np.minimum(rows + 1, source.shape[0] - 1)]
-    lines = upper + (lower - upper) * row_share[:, None]
-    # take keeps rows together, where lines[:, columns] would return columns: ten passes over the map follow.
-    left, right = (lines.take(at, axis=1) for at in (columns, np.minimum(columns + 1, source.shape[1] - 1)))
-    return left + (right - left) * column_share[None, :]
+    with np.errstate(invalid="ignore", over="ignore"):  # between two infinities, as in a sky, there is one
+        lines = np.where(upper == lower, upper, upper + (lower - upper) * row_share[:, None])
+        # take keeps rows together, where lines[:, columns] would return columns: ten passes over the map follow.
+        left, right = (lines.take(at, axis=1) for at in (columns, np.minimum(columns + 1, source.shape[1] - 1)))
+        return np.where(left == right, left, left + (right - left) * column_share)
 
 
 def _aligned(small: int, large: int) -> tuple[np.ndarray, np.ndarray]:

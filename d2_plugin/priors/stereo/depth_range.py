@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from d2_plugin.errors import D2Error
-from d2_plugin.priors.geometry import check_depth_range, projected, scaled_camera, view_pair, viewing_rays
+from d2_plugin.priors.geometry import check_depth_range, projected, same_spot, scaled_camera, view_pair, viewing_rays
 from d2_plugin.priors.stereo.settings import StereoSettings
 from d2_plugin.recordings.recording import Camera
 
@@ -58,11 +58,11 @@ def _bounds_from_baselines(cameras: Sequence[Camera], max_angle: float) -> Depth
     """From where two cameras begin to see something alike to half a pixel of disparity between the farthest pair."""
     centres = np.stack([camera.centre for camera in cameras])
     distances = np.linalg.norm(centres[:, None] - centres[None], axis=-1)
-    if not distances.any():
+    pairs = [(a, b) for a in cameras for b in cameras if not same_spot(a, b)]
+    if not pairs:
         names = ", ".join(camera.name for camera in cameras)
         raise D2Error(f"cameras {names} stand at one point, so nothing can be triangulated: use cameras that are apart")
     far = max(float(camera.K[0, 0]) for camera in cameras) * float(distances.max()) / 0.5
-    pairs = [(a, b) for i, a in enumerate(cameras) for j, b in enumerate(cameras) if distances[i, j] > 0]
     nearest = np.concatenate([_first_shared_depths(reference, source, far, max_angle) for reference, source in pairs])
     if nearest.size == 0:
         return DepthBounds(far / 1e4, far, "baselines alone, and no two cameras see the same")

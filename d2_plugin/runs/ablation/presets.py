@@ -101,9 +101,7 @@ camera splits that are not public: for comparing the order of rows, not their si
 
 
 def rows_named(
-    names: Sequence[str],
-    presets: Mapping[str, Preset] = PRESETS,
-    tables: Mapping[str, Sequence[str]] = TABLES,
+    names: Sequence[str], presets: Mapping[str, Preset] = PRESETS, tables: Mapping[str, Sequence[str]] = TABLES
 ) -> tuple[Preset, ...]:
     """The presets of tables and single presets, each once, in the order of `presets`.
 

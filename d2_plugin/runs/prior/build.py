@@ -44,9 +44,7 @@ def build_priors_for(
 
             build = partial(build_priors_on_cluster, **cluster)
         summary = build(
-            *(scene.recording, scene.train_cameras, folder, scene.prior_settings),
-            sparse_points=points,
-            progress=report,
+            *(scene.recording, scene.train_cameras, folder, scene.prior_settings), sparse_points=points, progress=report
         )
     if between and scene.prior_settings.between and scene.plan.uses("temporal") and shard is None:
         store = PriorStore.described(PriorStore.located(folder, scene.train_cameras))

@@ -10,7 +10,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from d2_plugin.durable import CannotWrite
 from d2_plugin.errors import D2Error
+from d2_plugin.locks import Busy
 from d2_plugin.runs.rows import Row, make_row, rms_error
 from d2_plugin.runs.run import Run
 from d2_plugin.runs.saved import read_metrics
@@ -71,6 +73,8 @@ def measure(work: Work) -> Row:
     be_silent()
     try:
         return _row(work, _metrics(work))
+    except (Busy, CannotWrite):  # the next call finds it mended: a row would count as measured
+        raise
     except D2Error as error:
         return _row(work, None, str(error))
 

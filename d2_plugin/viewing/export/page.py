@@ -76,8 +76,8 @@ def write_page(scenes: Sequence[ExportScene], path: Path) -> list[str]:
     return about
 
 
-def _recorded(scene: ExportScene, data: bytearray) -> dict[str, list[tuple[int, int, int]]]:
-    """Images of the held-out cameras: of each the place of the frame, where it stands and its length."""
+def _recorded(scene: ExportScene, data: bytearray) -> dict[str, list[tuple[float, int, int]]]:
+    """Images of the held-out cameras: of each when it was taken, where it stands and its length."""
     recording, names = scene.viewed.recording, scene.viewed.test_cameras or scene.viewed.train_cameras
     cameras = [recording.cameras[name] for name in names]
     cv2 = opencv("a page with recorded images")
@@ -91,11 +91,12 @@ def _recorded(scene: ExportScene, data: bytearray) -> dict[str, list[tuple[int, 
 
     most = max(int(RECORDED_BYTES / sum(len(image(camera, 0)) for camera in cameras)), 1)
     places = spread(range(len(recording.frames)), most)
-    kept: dict[str, list[tuple[int, int, int]]] = {}
+    kept: dict[str, list[tuple[float, int, int]]] = {}
     for camera in cameras:
         for place in places:
             written = image(camera, place)
-            kept.setdefault(camera.name, []).append((place, _placed(data, written), len(written)))
+            taken = recording.seconds(recording.frames[place], camera.name)
+            kept.setdefault(camera.name, []).append((taken, _placed(data, written), len(written)))
     return kept
 
 

@@ -24,7 +24,7 @@ class Confirmation(NamedTuple):
     """Confirmation of each depth of a view by all sources together; maps [H, W]."""
 
     sources: np.ndarray
-    """uint8: how many sources confirm it."""
+    """uint16: how many sources confirm it."""
     parallax: np.ndarray
     """Root of the sum over confirming sources of P^2, with P the pixels that the match moves per unit of log depth."""
     spread: np.ndarray
@@ -45,7 +45,7 @@ def confirm(
     `min_angle` and `max_angle`.
     """
     reference, depth = cameras[index], np.ascontiguousarray(depths[index], np.float32)
-    sums = _Sums(np.zeros(depth.shape, np.uint8), np.zeros(depth.shape), np.zeros(depth.shape))
+    sums = _Sums(np.zeros(depth.shape, np.uint16), np.zeros(depth.shape), np.zeros(depth.shape))
     for other, source in enumerate(cameras):
         if other != index:
             theirs = np.ascontiguousarray(depths[other], np.float32)
@@ -57,7 +57,7 @@ def confirm(
 class _Sums(NamedTuple):
     """Over the sources so far: how many confirm, sum of P^2, and of P^2 times the squared relative difference."""
 
-    confirming: np.ndarray  # uint8 [H, W]
+    confirming: np.ndarray  # uint16 [H, W]
     information: np.ndarray  # float64 [H, W]
     difference: np.ndarray  # float64 [H, W]
 

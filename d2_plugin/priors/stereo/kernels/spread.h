@@ -112,14 +112,15 @@ struct Neighbours {
   }
 };
 
-// Weights that sum to 1; sources with next to none are dropped.
+// Weights that sum to 1; sources with next to none are dropped, but not all: of 30 and more the even share is as small.
 template <class S>
 D2_FN void normalise(const Task& t, Selection<S>& selection, S total) {
   const S zero = all<S>(0.f), even = all<S>(1.f / float(t.source_count));
+  const float least = smaller(1.f / 30, .99f / float(t.source_count));
   S kept = zero;
   for (int s = 0; s < t.source_count; s++) {
     const S share = pick(total > 0.f, selection.weight[s] / total, even);
-    selection.weight[s] = pick(share < 1.f / 30, zero, share);
+    selection.weight[s] = pick(share < least, zero, share);
     kept += selection.weight[s];
   }
   selection.views = Word<S>{};

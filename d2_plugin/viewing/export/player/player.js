@@ -299,7 +299,7 @@ class Photos {
     const kept = this.header.recorded[camera.name] || [], blob = ([, at, length]) => new Blob([this.raw.slice(at, at + length)]);
     Object.assign(this, { camera, decoded: [] });
     this.loaded = Promise.all(kept.map((entry) => createImageBitmap(blob(entry)))).then((images) => {
-      if (this.camera === camera) this.decoded = images.map((image, i) => ({ image, time: this.header.seconds[kept[i][0]] }));
+      if (this.camera === camera) this.decoded = images.map((image, i) => ({ image, time: kept[i][0] }));
       this.changed();
     });
     return this.loaded;

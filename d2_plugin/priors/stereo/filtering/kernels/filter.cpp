@@ -41,7 +41,7 @@ struct Confirm {
   double nudge;                                      // factor of depth by which parallax is measured
   double nudge_squared;                              // of its logarithm
   const float *depth, *theirs;                       // 0 where there is none
-  uint8_t* confirming;                               // how many sources confirmed: grows by one where this one does
+  uint16_t* confirming;                              // how many sources confirmed: grows by one where this one does
   double *information, *difference;                  // sums of P^2, and of P^2 times the squared relative difference
 };
 
