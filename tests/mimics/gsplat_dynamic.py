@@ -127,7 +127,9 @@ def train_step(item, params, optimizers, hexplane, deform_net, hex_optimizer, st
     with torch.no_grad():
         strategy.step_post_backward(params, optimizers, state, step, info)
 
-    return {"loss": float(loss.detach().item())}
+    return {
+        "loss": float(loss.detach().item()),
+    }
 
 
 def training(params, optimizers, hexplane, deform_net, checkpoint=None, stop: int = 10**9) -> SimpleNamespace:
@@ -139,7 +141,10 @@ def training(params, optimizers, hexplane, deform_net, checkpoint=None, stop: in
     if checkpoint:
         (params, optimizers, state, hexplane, deform_net, hex_optimizer), first = checkpoint
 
-    scheduler = TwoStageScheduler(coarse_steps=first, fine_steps=min(100, stop))
+    scheduler = TwoStageScheduler(
+        coarse_steps=first,
+        fine_steps=min(100, stop),
+    )
     for step in scheduler.steps:
         torch.manual_seed(step)
         item = dataset[shuffled(len(dataset), step)[0]]
