@@ -104,7 +104,8 @@ class FudanAdapter(InriaAdapter):
         (forward.cu:71-175)."""
         model, time_degree = self.gaussians, int(optional(self.gaussians, "active_sh_degree_t", 0))
         splats = splats._replace(means=model._xyz[splats.rows])
-        if not time_degree or model.gaussian_dim == 3 or model.active_sh_degree < 3 or model.force_sh_3d:
+        flat = model.gaussian_dim == 3 or optional(model, "force_sh_3d", False)
+        if not time_degree or flat or model.active_sh_degree < 3:
             return super().colors(view, splats)
         phase = (view.time - model._t[splats.rows, 0]) / (model.time_duration[1] - model.time_duration[0])
         return seen_colors(self._harmonics(), view, splats, int(model.active_sh_degree), phase, time_degree)

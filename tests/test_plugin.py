@@ -103,11 +103,13 @@ def test_a_backbone_that_changes_silently_is_noticed_once() -> None:
 
 
 def test_a_change_that_is_told_and_one_that_is_not_spoil_no_count_of_what_the_trainer_added() -> None:
-    model = make_model()
-    d2 = D2Hooks(replace(ALL_HOOKS, densify=DensifyConfig(max_gaussians=30)), Yang4DAdapter(model), TinyStore())
-    model.select(torch.arange(60).repeat(2))
-    model.gaussians.select(torch.arange(110))
-    with pytest.warns(UserWarning, match="without telling"):
+    model, view, ones = make_model(), make_views()[0], torch.ones(10)
+    adapter = Yang4DAdapter(model)
+    d2 = D2Hooks(D2Config(densify=DensifyConfig(max_gaussians=30)), adapter, TinyStore())
+    d2.loss(1, view)
+    adapter.insert(Points(torch.tensor([[0.0, 0, 3]] * 10), torch.zeros(10, 3), 0 * ones, ones / 10, ones / 2))
+    model.gaussians.select(torch.arange(80) % 70)  # not through the choke point
+    with pytest.warns(UserWarning, match="from 70 to 80 Gaussians without telling"):
         d2.step(1)
 
 
