@@ -138,9 +138,8 @@ class Hust4DAdapter(InriaAdapter):
 
     def _inside(self, points: Points) -> Points:
         box = self.gaussians._deformation.get_aabb
-        corners = torch.stack(
-            [torch.as_tensor(corner).to(points.positions) for corner in (box() if callable(box) else box)]
-        )
+        box = box() if callable(box) else box
+        corners = torch.stack([torch.as_tensor(corner).to(points.positions) for corner in box])
         low, high = corners.amin(0), corners.amax(0)
         inside = ((points.positions >= low) & (points.positions <= high)).all(-1)
         return points.select(inside)

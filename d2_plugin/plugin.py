@@ -14,7 +14,7 @@ import os
 import threading
 import warnings
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar, cast
 
@@ -54,14 +54,6 @@ if hasattr(os, "register_at_fork"):
 Method = TypeVar("Method", bound=Callable[..., Any])
 
 
-@contextlib.contextmanager
-def _in_full() -> Iterator[None]:
-    """Outside of the trainer's autocast: 16 bits place points pixels away from where they are."""
-    on_gpu = torch.autocast("cuda", enabled=False) if torch.is_autocast_enabled() else contextlib.nullcontext()
-    with torch.autocast("cpu", enabled=False), on_gpu:
-        yield
-
-
 def _by_one_thread(method: Method) -> Method:
     """Refuse a call while another thread is within one; compute in full precision."""
 
@@ -70,7 +62,9 @@ def _by_one_thread(method: Method) -> Method:
         if not self._used.acquire(blocking=False):
             raise D2Error("two threads use one D2Hooks at once: call d2.loss and d2.step from the thread that trains")
         try:
-            with _in_full():
+            # Outside of the trainer's autocast: 16 bits place points pixels away from where they are.
+            on_gpu = torch.autocast("cuda", enabled=False) if torch.is_autocast_enabled() else contextlib.nullcontext()
+            with torch.autocast("cpu", enabled=False), on_gpu:
                 return method(self, *given, **named)
         finally:
             self._used.release()

@@ -67,7 +67,7 @@ class ShimLauncher:
 
 @functools.cache
 def shim_library(channels: int) -> ctypes.CDLL:
-    flags = (f"-DD2_CHANNELS={channels}", f"-DD2_FRAME_SIZE={ctypes.sizeof(cuda.Frame)}", "-ffp-contract=off")
+    flags = (f"-DD2_CHANNELS={channels}", f"-DD2_FRAME_SIZE={ctypes.sizeof(cuda.Frame)}", "-ffp-contract=off", "-O1")
     headers = (HERE / "cuda_shim.h", cuda.PROGRAM.source, *cuda.PROGRAM.headers)
     library = load_library("cuda-shim", (HERE / "cuda_shim.cpp",), headers, flags)
     library.d2_shim_launch.restype = ctypes.c_char_p

@@ -109,7 +109,8 @@ class RunLog:
             if paced != iterations:
                 log.info("schedules count as the optimizer does: %d steps are worth %d of Adam's", iterations, paced)
             self._warn_of_short_schedules(paced)
-        _at_exit(self)
+        end = weakref.WeakMethod(self.end)  # the run may be gone when the process ends
+        atexit.register(lambda: alive() if (alive := end()) else None)
 
     def record_loss(self, name: str, term: Tensor) -> None:
         """A hook's term of the loss in the present step."""
@@ -239,9 +240,3 @@ class _StderrHandler(logging.Handler):
 def _schedule(name: str, config: HookConfig) -> str:
     until = "the end" if config.stop is None else f"{config.stop}"
     return f"{name} {config.start} to {until}" + (f" every {config.every}" if config.every > 1 else "")
-
-
-def _at_exit(run: RunLog) -> None:
-    """Log the summary when the process ends, unless the run is gone by then."""
-    end = weakref.WeakMethod(run.end)
-    atexit.register(lambda: alive() if (alive := end()) else None)

@@ -183,12 +183,14 @@ def flying_pixels(depth: np.ndarray) -> np.ndarray:
     made for less noise.
     """
     height, width = depth.shape
-    padded = np.pad(depth, NEIGHBOURS)
-    agreeing = np.zeros(depth.shape, np.int32)
+    padded = np.pad(depth, NEIGHBOURS, constant_values=np.nan)  # beyond the image nothing lies elsewhere
+    agreeing, around = np.zeros(depth.shape, np.int32), np.zeros(depth.shape, np.int32)
     steps = range(2 * NEIGHBOURS + 1)
     for row, column in itertools.product(steps, steps):
-        agreeing += np.abs(padded[row : row + height, column : column + width] - depth) < SAME_SURFACE * depth
-    return (depth > 0) & (2 * (agreeing - 1) < len(steps) ** 2 - 1)
+        beside = padded[row : row + height, column : column + width]
+        agreeing += np.abs(beside - depth) < SAME_SURFACE * depth
+        around += beside >= 0
+    return (depth > 0) & (2 * (agreeing - 1) < around - 1)
 
 
 def _meaning(path: Path) -> tuple[float, bool]:

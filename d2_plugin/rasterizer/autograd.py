@@ -109,10 +109,8 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
-        inputs, (color, depth_sum, alpha, front, records, lists) = (
-            ctx.saved_tensors[:INPUTS],
-            ctx.saved_tensors[INPUTS:],
-        )
+        inputs = ctx.saved_tensors[:INPUTS]
+        color, depth_sum, alpha, front, records, lists = ctx.saved_tensors[INPUTS:]
         means, covariances, opacities, colors = inputs[:4]
         kernels, frame = _frame(inputs, color.shape[1], color.shape[0], ctx.constants)
         frame.pointing(color=color, depth_sum=depth_sum, alpha=alpha, front=front, records=records)

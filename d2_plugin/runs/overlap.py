@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from d2_plugin.priors.geometry import relative_pose, scaled_camera, view_pair, viewing_rays
+from d2_plugin.priors.geometry import projected, relative_pose, scaled_camera, view_pair, viewing_rays
 from d2_plugin.priors.stereo.filtering.filter import texture_mask
 from d2_plugin.priors.stereo.geometric_depth import gray
 from d2_plugin.priors.stereo.settings import StereoSettings
@@ -103,13 +103,9 @@ def _depths(
 ) -> np.ndarray | None:
     """Depths [D] at which the things in a camera's image lie, or None if they are unknown."""
     if depth_range is None and points is not None:
-        local = points @ camera.T_camera_world[:3, :3].T + camera.T_camera_world[:3, 3]
-        local = local[local[:, 2] > 0]
-        pixels = local @ camera.K.T
-        inside = (pixels[:, :2] >= 0) & (pixels[:, :2] < pixels[:, 2:] * (camera.width, camera.height))
-        visible = local[inside.all(axis=1), 2]
-        if visible.size >= ENOUGH_POINTS:
-            return np.quantile(visible, np.linspace(0.05, 0.95, KNOWN_DEPTHS))
+        _, depths, seen = projected(camera, points)
+        if np.count_nonzero(seen) >= ENOUGH_POINTS:
+            return np.quantile(depths[seen], np.linspace(0.05, 0.95, KNOWN_DEPTHS))
     declared = [other.near_far for other in (camera, *cameras) if other.near_far is not None]
     if depth_range is None and not declared:
         return None

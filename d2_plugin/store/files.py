@@ -119,30 +119,26 @@ class EntryFolder:
             path.with_suffix(".json").unlink(missing_ok=True)
 
     def write(self, camera: str, frame: int, array: np.ndarray, record: dict[str, Any]) -> dict[str, Any]:
-        """Write the array and its record (see `write_entry`)."""
-        return write_entry(self.location(camera, frame), array, record, self.synced)
+        """Array first, record second, each written whole: a record vouches for the array beside it.
 
+        What is not `synced` may be damaged after a power cut, which its checksums show: for what can be made again.
 
-def write_entry(path: Path, array: np.ndarray, record: dict[str, Any], synced: bool = True) -> dict[str, Any]:
-    """Array first, record second, each written whole: a record vouches for the array beside it.
+        Returns:
+            The record as it was written.
 
-    What is not `synced` may be damaged after a power cut, which its checksums show: for what can be made again.
-
-    Returns:
-        The record as it was written.
-
-    Raises:
-        CannotWrite: the disk is full, broken or not ours.
-    """
-    plain = np.ascontiguousarray(array)
-    header = io.BytesIO()
-    np.lib.format.write_array_header_1_0(header, np.lib.format.header_data_from_array_1_0(plain))
-    pixels = plain.reshape(-1).view(np.uint8)
-    write(path, header.getvalue(), pixels.data, synced=synced)
-    described = {"shape": list(array.shape), "dtype": str(array.dtype), "checksum": zlib.crc32(pixels.data)}
-    written = {**record, **described}
-    write_table(path.with_suffix(".json"), written, RECORD, synced)
-    return written
+        Raises:
+            CannotWrite: the disk is full, broken or not ours.
+        """
+        path = self.location(camera, frame)
+        plain = np.ascontiguousarray(array)
+        header = io.BytesIO()
+        np.lib.format.write_array_header_1_0(header, np.lib.format.header_data_from_array_1_0(plain))
+        pixels = plain.reshape(-1).view(np.uint8)
+        write(path, header.getvalue(), pixels.data, synced=self.synced)
+        described = {"shape": list(array.shape), "dtype": str(array.dtype), "checksum": zlib.crc32(pixels.data)}
+        written = {**record, **described}
+        write_table(path.with_suffix(".json"), written, RECORD, self.synced)
+        return written
 
 
 def _mapped(path: Path) -> np.ndarray:

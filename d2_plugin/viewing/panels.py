@@ -9,8 +9,7 @@ from functools import cached_property
 import numpy as np
 from torch import Tensor
 
-from d2_plugin.priors.sheet import sigma_colors
-from d2_plugin.protocol import DepthPrior, View
+from d2_plugin.protocol import View
 from d2_plugin.recordings.images import opencv
 from d2_plugin.runs.drawing import Panel, Scale, as_bytes, colorize, depth_panel, error_panel
 from d2_plugin.viewing.rendering import RenderedView, render_view
@@ -86,9 +85,3 @@ def fitted(array: np.ndarray, width: int, height: int, nearest: bool = False) ->
     large = cv2.resize(array, whole, interpolation=how)
     left, top = (whole[0] - width) // 2, (whole[1] - height) // 2
     return large[top : top + height, left : left + width]
-
-
-def prior_sigma_colors(prior: DepthPrior) -> np.ndarray:
-    """RGB uint8 [h, w, 3] of the relative standard deviation that a prior declares, grey where it declares none."""
-    sigma = np.full(prior.depth.shape, np.inf, np.float32) if prior.sigma is None else prior.sigma.numpy()
-    return sigma_colors(sigma, prior.depth.numpy())

@@ -159,7 +159,7 @@ def test_every_rival_trains_on_one_prior_and_says_its_name(saved_room: Callable[
     room = saved_room(cameras=2, held_out=1, frames=2, width=96, height=54)
     presets = rows_named(["backbone", *RIVALS, "full"], PRESETS | RIVAL_PRESETS)
     with measured_at_once():
-        ablate(RunSettings(str(room), ("train0", "train1"), iterations=24), presets, ["yang4d"], [0], tmp_path, 1, "")
+        ablate(RunSettings(str(room), ("train0", "train1"), iterations=4), presets, ["yang4d"], [0], tmp_path, 1, "")
     rows = read_rows([tmp_path / "runs.jsonl"])
     assert {row["method"].removeprefix("yang4d ") for row in rows} == {"backbone", *RIVALS, "full"}
     assert [path.name for path in (tmp_path / "priors").iterdir() if path.is_dir()] == ["dual"]

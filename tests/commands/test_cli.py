@@ -68,7 +68,10 @@ def test_evaluating_again_gives_the_same_scores(finished: Path) -> None:
     assert (after["test"], after["per_view"]) == (before["test"], before["per_view"])
 
 
-def test_priors_are_built_in_parts_and_shown_on_a_sheet(recording, finished, tmp_path, capsys, answered) -> None:
+def test_priors_are_built_in_parts_and_shown_on_a_sheet(
+    recording, finished, tmp_path, capsys, answered, monkeypatch
+) -> None:
+    monkeypatch.setattr("d2_plugin.runs.prior.trials.STEPS", 10)
     build = ["priors", str(recording), "--train-cameras", CAMERAS, "--output", str(tmp_path)]
     assert main([*build, "--shard", "2/2"]) == 0
     assert not (tmp_path / "contact_sheet.png").exists()

@@ -86,6 +86,25 @@ def test_the_slopes_are_found_that_one_patch_of_depth_leaves_open(room: Recordin
         assert alignment.across < 0.1
 
 
+def test_a_floor_below_cameras_of_one_height_fits_with_every_slope_so_a_metric_map_keeps_its_own() -> None:
+    rows = np.arange(90)[:, None] + 0.5 + np.zeros((1, 160))
+    depth = 1.5 * 100 / np.maximum(rows - 30, 10)  # 1.5 below a camera of focal length 100
+    views = {}
+    for number in range(2):
+        pose = np.eye(4)
+        pose[0, 3] = -0.5 * number
+        camera = replace(camera_at(size=(160, 90)), K=np.array([[100.0, 0, 80], [0, 100, 30], [0, 0, 1]]))
+        mono = np.where(rows > 40, depth, np.nan).astype(np.float32)
+        geometric = np.where((rows > 60) & (rows < 63) & (np.arange(160) < 99), depth, 0).astype(np.float32)
+        alignment = align(mono, geometric, kind="metric", settings=ALIGN)
+        views[str(number)] = Shown(replace(camera, T_camera_world=pose), mono, geometric, alignment)
+    found = aligned_across(views, "metric")
+    assert set(found) == set(views)
+    for name, alignment in found.items():
+        np.testing.assert_allclose(alignment.scale * views[name].mono[41:] + alignment.shift, depth[41:], rtol=0.2)
+        assert alignment.across >= 0.01, "a map that was bent by anchors is not known better"
+
+
 def line(alignment: Alignment) -> tuple[float, float]:
     return alignment.scale, alignment.shift
 

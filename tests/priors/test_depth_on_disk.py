@@ -14,7 +14,7 @@ from d2_plugin.errors import D2Error
 from d2_plugin.priors import depth_on_disk
 from d2_plugin.priors.build import build_priors
 from d2_plugin.priors.colmap.workspace import WorkspaceDepth, scale_of_world, seen_by
-from d2_plugin.priors.depth_on_disk import DepthOnDisk, SensorDepth, find_depth_on_disk
+from d2_plugin.priors.depth_on_disk import DepthOnDisk, SensorDepth, find_depth_on_disk, flying_pixels
 from d2_plugin.priors.frame import Frame
 from d2_plugin.priors.geometry import index_intrinsics
 from d2_plugin.priors.settings import PriorSettings, StereoSettings
@@ -158,6 +158,8 @@ def test_pixels_between_two_surfaces_are_dropped_and_plain_walls_are_kept(noise:
     assert wrong.sum() > 300
     assert (depth[wrong] > 0).mean() < 0.02
     assert (depth[right] > 0).mean() > 0.95
+    wall = np.full((20, 30), 2, np.float32)
+    assert not flying_pixels(wall).any(), "nothing lies beyond the rim of an image"
 
 
 def test_one_camera_with_a_depth_sensor_has_a_verified_prior(recording: Recording) -> None:

@@ -131,7 +131,7 @@ def test_only_good_planes_are_handed_over_the_best_of_them_and_none_seen_edge_on
     assert not handed_over(empty, [seen_plane(theirs, across, across @ ours.centre, 0.1)]).any()
 
 
-@pytest.mark.parametrize("scale", [1e-15, 1e-3, 1e4, 1e12])
+@pytest.mark.parametrize("scale", [1e-15, 1e12])
 def test_the_unit_of_length_does_not_matter(rig: Rig, native: Maps, scale: float) -> None:
     (near, far), metres = rig.depth_range, native[0][0]
     cameras = [moved(camera, scale) for camera in rig.cameras]

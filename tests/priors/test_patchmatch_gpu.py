@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from refusals import refuses
+from splat_scenes import ShimLauncher
 
 from benchmarks.stereo_rigs import Rig, textured_rig
 from d2_plugin.compiler import load_library, nvrtc
@@ -27,13 +28,7 @@ HERE = Path(__file__).parent
 SETTINGS = StereoSettings()
 
 
-class ShimDriver:
-    """Runs the kernels on the CPU, with blocks, warps and lanes in an order of `cuda_shim.h`."""
-
-    def __init__(self, order: int = 0) -> None:
-        self.order = order
-        self.launched: set[str] = set()
-
+class ShimDriver(ShimLauncher):
     def launch(self, kernel: str, sources: int, grid: tuple[int, int], threads: int, call: Call) -> None:
         self.launched.add(kernel)
         error = shim_library(sources).d2_shim_launch(kernel.encode(), grid[0], self.order, ctypes.byref(call))
@@ -43,7 +38,7 @@ class ShimDriver:
 @functools.cache
 def shim_library(sources: int) -> ctypes.CDLL:
     shim = HERE.parent / "rasterizer" / "cuda_shim.h"
-    flags = (*(flag for flag in flags_for(sources) if flag.startswith("-D")), "-ffp-contract=off")
+    flags = (*(flag for flag in flags_for(sources) if flag.startswith("-D")), "-ffp-contract=off", "-O1")
     headers = (shim, PROGRAM.source, *PROGRAM.headers)
     library = load_library("patchmatch-shim", (HERE / "patchmatch_shim.cpp",), headers, flags)
     library.d2_shim_launch.restype = ctypes.c_char_p

@@ -176,8 +176,8 @@ def other_instructions(request: pytest.FixtureRequest, monkeypatch: pytest.Monke
     """The CPU's kernels, compiled for fewer lanes than this machine may have."""
     if os.uname().machine != "x86_64":
         pytest.skip("flags of x86")
-    if "v3" in request.param and "avx2" not in File("/proc/cpuinfo").read_text():
-        pytest.skip("no AVX2 here")
+    if "v3" in request.param and "avx512f" not in File("/proc/cpuinfo").read_text():
+        pytest.skip("no AVX-512 here: what this machine's own kernels have is no wider")
     monkeypatch.setenv("D2_CXXFLAGS", request.param)
     native.library.cache_clear()
     yield Path(torch.float32)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from refusals import refuses
@@ -117,3 +118,11 @@ def test_models_beyond_eight_coefficients_are_refused() -> None:
     with pytest.raises(D2Error, match="camera 3 in intri.yml has 12 distortion coefficients.*undistort the images"):
         checked_lens(K, "opencv", np.array([0.1, 0, 0, 0, 0, 0, 0, 0.2, 0, 0, 0.1, 0]), "camera 3 in intri.yml")
     refuses("expected finite numbers", checked_lens, K, "opencv", np.array([math.nan, 0, 0, 0]), "here")
+
+
+@pytest.mark.parametrize("coefficients", [(0.1, 0.02, 0.0, 0.0, 0.0), (-0.2, 0.05, 0.001, -0.002, -0.01)])
+def test_a_lens_bends_as_kornias(coefficients: tuple[float, ...]) -> None:
+    kornia = pytest.importorskip("kornia", reason="kornia is in the `test` extra")
+    pixels = np.random.default_rng(0).uniform((0, 0), SIZE, (200, 2))
+    theirs = kornia.geometry.calibration.distort_points(*map(torch.tensor, (pixels, K, np.array(coefficients))))
+    np.testing.assert_allclose(Lens(K, "opencv", coefficients).recorded_pixels(pixels), theirs, rtol=0, atol=1e-9)

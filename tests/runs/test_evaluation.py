@@ -179,3 +179,11 @@ def test_what_moves_is_scored_by_itself() -> None:
     assert scores["psnr"] > 25
     still = evaluate(plain(0.0), moving_recording(0.0), ["test0"], recording.frames)["test"]
     assert still["psnr_moving"] is None, "where nothing moves there is no such score"
+
+
+def test_viridis_is_kornias_within_a_shade() -> None:
+    kornia = pytest.importorskip("kornia", reason="kornia is in the `test` extra")
+    theirs = kornia.color.ColorMap("viridis", 256, device=torch.device("cpu"), dtype=torch.float64).colors.T
+    difference = np.abs(drawing.color_scale("viridis") / 255 - theirs.numpy())
+    assert difference.max() < 0.08  # nine anchors, straight lines between them
+    assert difference.mean() < 0.01

@@ -34,6 +34,11 @@ SLOPES = np.geomspace(0.03, 3, 28)
 map), or that of a line through the origin (of a depth map)."""
 FINER = 9
 """Slopes tried between a slope and its neighbours, each time the last step is refined."""
+LEANING = 0.03
+"""Share of the objective that a slope e times the unit or a e-th of it costs: cameras of one height see the same of a
+floor with every slope, and a map is nearer to what it says of itself than to nothing at all."""
+SUREST = 0.01
+"""Maps bent by the anchors of one scene are not known better than that, however well they fit each other."""
 LEAST_REACH = 0.05
 """Anchors nearer than this to the smallest values of an inverse map, as a share of its span, count as so far off."""
 SAMPLES = 5000
@@ -82,7 +87,7 @@ def aligned_across(views: Mapping[str, Shown], kind: MonoKind) -> dict[str, Alig
         fits = {name: _agreement(name, maps, lines) for name in maps}
         worst = min(wanted, key=lambda name: fits[name].matched)
         if fits[worst].matched >= MATCHED:
-            spreads = {name: fit.spread for name, fit in fits.items() if fit.matched >= MATCHED}
+            spreads = {name: max(fit.spread, SUREST) for name, fit in fits.items() if fit.matched >= MATCHED}
             alignments = {name: replace(views[name].alignment, across=spread) for name, spread in spreads.items()}
             shared = {name: _through(alignments[name], views[name], lines[name], kind) for name in wanted}
             return alignments | shared
@@ -218,13 +223,13 @@ def _fitted(maps: Mapping[str, _Map], wanted: Sequence[str]) -> dict[str, _Line]
     while len(slopes) < len(wanted):
         scores = {name: _scores(name, SLOPES, maps, lines) for name in wanted if name not in slopes}
         name = max(scores, key=lambda name: scores[name].max())
-        slopes[name] = float(SLOPES[scores[name].argmax()])
+        slopes[name] = float(SLOPES[(scores[name] * _leaning(SLOPES)).argmax()])
         lines[name] = maps[name].line(slopes[name])
     step = SLOPES[1] / SLOPES[0]
     for reach in (step, step, step ** (2 / FINER)):
         for name in wanted:
             tried = slopes[name] * np.geomspace(1 / reach, reach, FINER)
-            slopes[name] = float(tried[_scores(name, tried, maps, lines).argmax()])
+            slopes[name] = float(tried[(_scores(name, tried, maps, lines) * _leaning(tried)).argmax()])
             lines[name] = maps[name].line(slopes[name])
     return lines
 
@@ -235,10 +240,15 @@ def _first_two(maps: Mapping[str, _Map], wanted: Sequence[str]) -> dict[str, flo
     for one, other in combinations(wanted, 2):
         tried = [[maps[name].line(slope) for slope in SLOPES] for name in (one, other)]
         scores = _matches(maps[one], maps[other], *tried) + _matches(maps[other], maps[one], *tried[::-1]).T
+        scores *= np.outer(_leaning(SLOPES), _leaning(SLOPES))
         if scores.max() > best:
             first, second = np.unravel_index(scores.argmax(), scores.shape)
             best, slopes = float(scores.max()), {one: float(SLOPES[first]), other: float(SLOPES[second])}
     return slopes
+
+
+def _leaning(slopes: np.ndarray) -> np.ndarray:
+    return 1 - LEANING * np.abs(np.log(slopes))
 
 
 def _scores(name: str, slopes: np.ndarray, maps: Mapping[str, _Map], lines: Mapping[str, _Line]) -> np.ndarray:

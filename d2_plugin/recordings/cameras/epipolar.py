@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from d2_plugin.recordings.cameras.camera import rigid
 from d2_plugin.recordings.cameras.rotations import rotation_of_vector
 from d2_plugin.recordings.images import checked_image, opencv
 from d2_plugin.recordings.recording import Camera
@@ -93,8 +94,7 @@ def turned(name: str, cameras: Mapping[str, Camera], matched: Matched) -> Camera
 
 def rotated(camera: Camera, angles: np.ndarray) -> Camera:
     """The camera turned where it stands, about its own axes, by angles [3] in radians."""
-    turn = np.eye(4)
-    turn[:3, :3] = rotation_of_vector(angles)
+    turn = rigid(rotation_of_vector(angles), np.zeros(3))
     return replace(camera, T_camera_world=turn @ camera.T_camera_world)
 
 

@@ -40,7 +40,9 @@ class Undistortion:
         camera = self._recorded
         if not camera.lens.bends:
             return None
-        inside = recorded_at(camera, _centres(camera.width, camera.height))
+        places = camera.lens.recorded_pixels(_centres(camera.width, camera.height))
+        with np.errstate(invalid="ignore"):  # NaN is outside, and so is what lies half beyond the edge
+            inside = np.asarray(((places >= 0.5) & (places <= np.array(camera.size) - 0.5)).all(axis=-1))
         return None if inside.all() else inside
 
     def image(self, recorded: np.ndarray) -> np.ndarray:
@@ -63,9 +65,8 @@ class Undistortion:
         """Where each pixel comes from, as `cv2.remap` wants it; cv2 puts centres on whole numbers."""
         cv2 = opencv("undoing lens distortion")
         places = self._recorded.lens.recorded_pixels(_centres(self.camera.width, self.camera.height))
-        maps: tuple[Any, Any] = cv2.convertMaps(
-            np.nan_to_num(places - 0.5, nan=-10.0).astype(np.float32), None, cv2.CV_16SC2
-        )
+        inside = np.nan_to_num(places - 0.5, nan=-10.0).astype(np.float32)
+        maps: tuple[Any, Any] = cv2.convertMaps(inside, None, cv2.CV_16SC2)
         return maps
 
 
@@ -116,14 +117,6 @@ class UndistortedSource(Source):
 
     def __reduce__(self) -> tuple[Any, ...]:  # maps are made anew in another process
         return UndistortedSource, (self.source, self.cameras)
-
-
-def recorded_at(camera: CalibratedCamera, pixels: np.ndarray) -> np.ndarray:
-    """Whether the camera recorded the undistorted `pixels` [..., 2], bool [...]; half beyond the edge is not."""
-    places = camera.lens.recorded_pixels(pixels)
-    with np.errstate(invalid="ignore"):  # NaN is outside
-        inside = (places >= 0.5) & (places <= np.array(camera.size) - 0.5)
-    return np.asarray(inside.all(axis=-1))
 
 
 def refuse_black(camera: CalibratedCamera) -> float:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -21,14 +21,6 @@ JPEG_QUALITY = 98  # of the images that 4DGaussians insists to be JPEG
 LEAST_POINTS = 100  # fewer points of its own than this, and an instant starts from those of all instants
 
 
-class Image(NamedTuple):
-    """A registered image: its file name and the number and calibration of its camera."""
-
-    name: str
-    number: int
-    camera: Camera
-
-
 def write_colmap(export: Export) -> Written:
     """sparse/0/{cameras,images,points3D}.bin and images/CAMERA_FRAME.png; names are kept.
 
@@ -38,10 +30,7 @@ def write_colmap(export: Export) -> Written:
     recording = export.recording
     export.write_images(lambda camera, frame: export.folder / "images" / f"{camera}_{frame:04d}.png")
     first = recording.frames[0]
-    images = [
-        Image(f"{name}_{first:04d}.png", index + 1, camera)
-        for index, (name, camera) in enumerate(recording.cameras.items())
-    ]
+    images = {f"{name}_{first:04d}.png": camera for name, camera in recording.cameras.items()}
     write_model(export.folder / "sparse" / "0", images, export.cloud)
     if export.cloud is not None:
         write_point_cloud(export.folder / "sparse" / "0" / "points3D.ply", export.cloud)
@@ -67,7 +56,7 @@ def write_multipleview(export: Export) -> Written:
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(encode_jpeg(export.recording.image(name, frame), JPEG_QUALITY))
     # Its reader takes the digits behind the fifth letter of an image's name for the number of the camera.
-    images = [Image(f"image{index + 1}.jpg", index + 1, camera) for index, camera in enumerate(kept.values())]
+    images = {f"image{index + 1}.jpg": camera for index, camera in enumerate(kept.values())}
     write_model(export.folder / "sparse_", images, export.cloud)
     rows = [llff_row(camera, depth_bounds(camera, export.cloud)) for camera in kept.values()]
     np.save(export.folder / "poses_bounds_multipleview.npy", np.stack(rows))
@@ -102,7 +91,7 @@ def write_colmap_frames(export: Export) -> Written:
         refuse_off_centre(camera, "colmap_frames")
     frames = {frame: index for index, frame in enumerate(export.recording.frames)}
     export.write_images(lambda camera, frame: export.folder / names[camera] / f"{frames[frame]}.png")
-    images = [Image(f"{name}.png", index + 1, camera) for index, (name, camera) in enumerate(cameras.items())]
+    images = {f"{name}.png": camera for name, camera in cameras.items()}
     for frame, index in frames.items():
         folder = export.folder / f"colmap_{index}"
         write_model(folder / "sparse" / "0", images, _of_time(export.cloud, export.recording.seconds(frame)))
@@ -140,10 +129,7 @@ def write_gsplat(export: Export) -> Written:
     export.write_images(
         lambda camera, _: export.folder / "images" / f"{names[camera]}_{frame:04d}.png", frames=(frame,)
     )
-    images = [
-        Image(f"{names[name]}_{frame:04d}.png", index + 1, export.recording.cameras[name])
-        for index, name in enumerate(ordered)
-    ]
+    images = {f"{names[name]}_{frame:04d}.png": export.recording.cameras[name] for name in ordered}
     write_model(export.folder / "sparse" / "0", images, export.cloud)
     return export.written({name: names[name] for name in export.recording.cameras}, {frame: frame})
 
@@ -164,27 +150,20 @@ def test_every(trained: int, held_out: int) -> int:
     )
 
 
-def write_model(folder: Path, images: list[Image], cloud: PointCloud | None) -> None:
-    """cameras.bin, images.bin and points3D.bin; images have no observations and points no tracks."""
+def write_model(folder: Path, images: Mapping[str, Camera], cloud: PointCloud | None) -> None:
+    """cameras.bin, images.bin and points3D.bin of images by the names of their files, each with a camera of its own;
+    images have no observations and points no tracks."""
     folder.mkdir(parents=True)
-    cameras = {image.number: image.camera for image in images}
-    (folder / "cameras.bin").write_bytes(
-        struct.pack("<Q", len(cameras)) + b"".join(_camera_record(*item) for item in cameras.items())
-    )
-    records = [_image_record(index + 1, image) for index, image in enumerate(images)]
-    (folder / "images.bin").write_bytes(struct.pack("<Q", len(images)) + b"".join(records))
+    cameras, shots = [], []
+    for number, (name, camera) in enumerate(images.items(), start=1):
+        intrinsics = (camera.K[place] for place in ((0, 0), (1, 1), (0, 2), (1, 2)))
+        cameras.append(struct.pack("<iiQQ4d", number, PINHOLE, camera.width, camera.height, *intrinsics))
+        pose = camera.T_camera_world
+        head = struct.pack("<I7dI", number, *quaternion_of_rotation(pose[:3, :3]), *pose[:3, 3], number)
+        shots.append(head + name.encode() + b"\0" + struct.pack("<Q", 0))
+    for part, records in (("cameras", cameras), ("images", shots)):
+        (folder / f"{part}.bin").write_bytes(struct.pack("<Q", len(records)) + b"".join(records))
     (folder / "points3D.bin").write_bytes(_point_records(cloud))
-
-
-def _camera_record(number: int, camera: Camera) -> bytes:
-    intrinsics = (camera.K[place] for place in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    return struct.pack("<iiQQ4d", number, PINHOLE, camera.width, camera.height, *intrinsics)
-
-
-def _image_record(identity: int, image: Image) -> bytes:
-    pose = image.camera.T_camera_world
-    head = struct.pack("<I7dI", identity, *quaternion_of_rotation(pose[:3, :3]), *pose[:3, 3], image.number)
-    return head + image.name.encode() + b"\0" + struct.pack("<Q", 0)
 
 
 def _point_records(cloud: PointCloud | None) -> bytes:

@@ -181,8 +181,9 @@ def linked_names(names: Sequence[str], pairs: Iterable[tuple[str, str]]) -> list
 
 def _solved(names: Sequence[str], evidence: Sequence[Evidence], frame: float) -> dict[str, Clock]:
     offsets, errors = _least_squares(names, evidence)
-    if _worst(offsets, evidence, frame) is not None:
-        raise D2Error(_contradiction(names, evidence, frame))
+    worst = _worst(offsets, evidence, frame)
+    if worst is not None:
+        raise D2Error(_contradiction(names, evidence, frame, *worst))
     best = {name: min((e for e in evidence if name in e[:2]), key=lambda e: e.error) for name in names}
     return {name: Clock(offsets[name], errors[name], best[name].method) for name in names}
 
@@ -204,7 +205,9 @@ def _worst(offsets: Mapping[str, float], evidence: Sequence[Evidence], frame: fl
     return max(beyond, key=lambda pair: pair[1], default=None)
 
 
-def _contradiction(names: Sequence[str], evidence: Sequence[Evidence], frame: float) -> str:
+def _contradiction(
+    names: Sequence[str], evidence: Sequence[Evidence], frame: float, worst: Evidence, off: float
+) -> str:
     """Whose evidence it is, where leaving one camera or one kind of evidence out makes the rest agree."""
     methods = sorted({one.method for one in evidence})
     guilty = []
@@ -212,14 +215,10 @@ def _contradiction(names: Sequence[str], evidence: Sequence[Evidence], frame: fl
         rest, others = [one for one in evidence if name not in (one.one, one.other)], [n for n in names if n != name]
         if len(rest) >= len(others) and _worst(_least_squares(others, rest)[0], rest, frame) is None:
             guilty.append(name)
-    offsets, _ = _least_squares(names, evidence)
-    worst = _worst(offsets, evidence, frame)
-    assert worst is not None
-    one, off = worst
     said = (
         f"{' and '.join(methods)} contradict each other" if len(methods) > 1 else f"the {methods[0]} contradicts itself"
     )
-    between = f"by {off / frame:.1f} frames between {one.one} and {one.other}"
+    between = f"by {off / frame:.1f} frames between {worst.one} and {worst.other}"
     if len(guilty) == 1:
         without = f"without camera {guilty[0]} all agree (is it of another event?)"
         return f"{said} {between}, and {without}: leave camera {guilty[0]} out, {INSTEAD}"

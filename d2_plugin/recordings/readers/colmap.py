@@ -59,14 +59,10 @@ def open_colmap(path: Path, cameras: tuple[str, ...] | None = None, intersect: b
 def _shots(model: ColmapModel, files: Iterable[str]) -> tuple[dict[str, ColmapImage], dict[str, Shot], tuple[str, ...]]:
     """One registered image per camera, camera and frame of every image that has a pose, and notes."""
     poses, shots, reading = standing_cameras(model)
-    left_out = 0
-    for name in files:
-        if name not in shots:
-            shot = reading(name) if reading else None
-            if shot is not None and shot.camera in poses:
-                shots[name] = shot
-            else:
-                left_out += 1
+    others = [name for name in files if name not in shots]
+    read = ((name, reading(name)) for name in others if reading)
+    further = {name: shot for name, shot in read if shot is not None and shot.camera in poses}
+    shots, left_out = shots | further, len(others) - len(further)
     notes = (f"{left_out} images left out because the COLMAP model has no pose for them",) if left_out else ()
     if reading is None and len(poses) > 1:
         notes = (*notes, "every image is a camera of its own at one instant: neither names nor poses show frames")

@@ -62,7 +62,9 @@ def open_n3dv(path: Path, cameras: tuple[str, ...] | None = None, intersect: boo
     rows, notes = _assigned(_rows(path / POSES), listed, intersect, path / POSES)
     pictured = {name for name in listed if (videos[name].stat().st_size if videos else extracted[name])}
     names, missing = cameras_with_images(rows, pictured, cameras, intersect, path / POSES)
-    notes, where = (*notes, *missing, *_known_flaws(path, names)), str(path / POSES)
+    flawed = [name for name in names if name in UNSYNCHRONISED.get(path.resolve().name, ())]
+    flaws = (f"{name} is known to be unsynchronised: consider leaving it out" for name in flawed)
+    notes, where = (*notes, *missing, *flaws), str(path / POSES)
     if not videos:
         images = {name: extracted[name] for name in names}
         frames, more = common_frames(images, path)
@@ -124,11 +126,6 @@ def _rows(path: Path) -> np.ndarray:
     if rows.ndim != 2 or rows.shape[1] != 17:
         raise D2Error(f"{path} has shape {rows.shape}, expected [cameras, 17]: see the LLFF format")
     return rows.astype(np.float64)
-
-
-def _known_flaws(path: Path, names: list[str]) -> tuple[str, ...]:
-    flawed = [name for name in names if name in UNSYNCHRONISED.get(path.resolve().name, ())]
-    return tuple(f"{name} is known to be unsynchronised: consider leaving it out" for name in flawed)
 
 
 def _extracted(path: Path) -> dict[str, FrameFiles]:

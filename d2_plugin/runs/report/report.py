@@ -99,9 +99,8 @@ def collect(sources: Sequence[Path]) -> tuple[list[Row], list[Image]]:
         if not runs:
             raise D2Error(f"no finished run lies in {source}: expected metrics.json, as `d2 train` writes it")
         folders += runs
-    rows = read_rows([source for source in sources if not source.is_dir()]) + [
-        training_row(folder) for folder in folders
-    ]
+    rows = read_rows([source for source in sources if not source.is_dir()])
+    rows += [training_row(folder) for folder in folders]
     first: dict[tuple[str, str], Image] = {}
     for folder in folders:
         metrics = read_metrics(folder)

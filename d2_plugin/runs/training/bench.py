@@ -179,11 +179,13 @@ def line_of(method: Method, known: Sequence[Row]) -> Line:
     """All targets of one method: the length of a run is tried with the first seed, then the other seeds follow."""
     settings, case = method.settings, method.case
     by_run = {(row["fingerprint"], row["target"]): row for row in known if row["kind"] == "quality"}
-    tried: list[Timed] = [
-        (row["iterations"], row["seconds"])
+    trained = list(case.settings.train_cameras)
+    mine = [
+        row
         for row in by_run.values()
-        if _same(row, case) and row["method"] == method.name and row["seconds"]
+        if row["case"] == case.name and row["method"] == method.name and row["cameras"] == trained
     ]
+    tried: list[Timed] = [(row["iterations"], row["seconds"]) for row in mine if row["seconds"]]
 
     def missing(works: Sequence[Work]) -> list[Work]:
         return [work for work in works if work.key not in by_run]
@@ -191,7 +193,8 @@ def line_of(method: Method, known: Sequence[Row]) -> Line:
     for kind, size in _targets(settings):
         target, steps = (f"{size:g} s", 0) if kind == "seconds" else (f"{size:g} steps", round(size))
         if not steps:
-            steps = _settled(by_run, method, target) or 0
+            # What an earlier call chose for this time.
+            steps = next((row["iterations"] for row in mine if row["target"] == target), 0)
             for _ in range(TRIES if not steps else 0):
                 length = next_steps(size, tried)
                 if any(length == n for n, _ in tried):
@@ -233,17 +236,6 @@ def fits(target: float, timed: Timed) -> bool:
 def nearest(target: float, tried: Sequence[Timed]) -> int:
     """Steps of the run whose time is nearest to the budget, in ratio."""
     return min(tried, key=lambda timed: abs(math.log(max(timed[1], 1e-3) / target)))[0]
-
-
-def _settled(by_run: dict[tuple[str, str], Row], method: Method, target: str) -> int | None:
-    """The number of steps that an earlier call chose for this time."""
-    mine = method.name, target
-    same = (row for row in by_run.values() if _same(row, method.case) and (row["method"], row["target"]) == mine)
-    return next((row["iterations"] for row in same), None)
-
-
-def _same(row: Row, case: Case) -> bool:
-    return row["case"] == case.name and row["cameras"] == list(case.settings.train_cameras)
 
 
 @dataclass(frozen=True)

@@ -8,13 +8,13 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from d2_plugin.priors.sheet import label_colors
+from d2_plugin.priors.sheet import label_colors, sigma_colors
 from d2_plugin.protocol import DepthPrior, Label
 from d2_plugin.recordings import Camera
 from d2_plugin.recordings.cameras.rotations import quaternion_of_rotation
 from d2_plugin.viewing.camera_paths import Rig
 from d2_plugin.viewing.live.page import Page, vertical_angle
-from d2_plugin.viewing.panels import fitted, prior_sigma_colors
+from d2_plugin.viewing.panels import fitted
 from d2_plugin.viewing.viewed import ViewedRun
 
 THUMBNAIL = 128
@@ -58,12 +58,10 @@ class Overlay:
             self._images_of = None
         for name, handle in self.frusta.items():
             # One beside us would fill the screen with its small image.
-            far = (
-                np.linalg.norm(viewed.recording.cameras[name].centre - (last.pose[:3] if last else 0))
-                > NEAR * self.unit
-            )
-            if handle.visible != (visible and far):
-                handle.visible = visible and far
+            apart = np.linalg.norm(viewed.recording.cameras[name].centre - (last.pose[:3] if last else 0))
+            shown = visible and bool(apart > NEAR * self.unit)
+            if handle.visible != shown:
+                handle.visible = shown
         if visible and not moving and frame != self._images_of:
             self._images_of = frame
             for name, handle in self.frusta.items():
@@ -139,6 +137,9 @@ def _points(camera: Camera, prior: DepthPrior, by: str, stride: int) -> Cloud:
     if by == "image":
         grey = torch.full((*depth.shape, 3), 160, dtype=torch.uint8)
         colors = (grey if thin.colors is None else thin.colors).numpy()
-    else:
-        colors = label_colors(thin.labels.numpy()) if by == "label" else prior_sigma_colors(thin)
+    elif by == "label":
+        colors = label_colors(thin.labels.numpy())
+    else:  # grey where no deviation is declared
+        sigma = np.full(depth.shape, np.inf, np.float32) if thin.sigma is None else thin.sigma.numpy()
+        colors = sigma_colors(sigma, depth)
     return Cloud(((rays * depth[shown][:, None] - t) @ R).astype(np.float32), colors[shown])

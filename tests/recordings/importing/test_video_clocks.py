@@ -97,18 +97,18 @@ def test_motion_finds_the_offset_within_two_of_its_errors_and_half_a_frame(
 
 
 def test_motion_that_repeats_itself_is_doubted(shared_data: Callable[[str], Path]) -> None:
-    recording = open_recording(shared_data("studio"))
+    recording = open_recording(shared_data("studio"), downscale=2)
     there_and_back = [*range(12), *range(10, 0, -1)]
     seen = by_motion(filmed(recording, {"03": 0, "04": 5, "05": 14}, 0, 2 * there_and_back))
     assert any("is the motion repeated?" in one.doubt for one in seen.values())
 
 
 def test_motion_of_another_event_is_doubted(shared_data: Callable[[str], Path]) -> None:
-    views = filmed(open_recording(shared_data("studio")), dict.fromkeys(["02", "03", "04", "05"], 0.0), 0)
+    views = filmed(open_recording(shared_data("studio"), downscale=2), dict.fromkeys(["02", "03", "04", "05"], 0.0), 0)
     camera, images, times = views["03"]
     rng = np.random.default_rng(1)
-    wall = rng.integers(0, 255, (180, 24)).astype(np.uint8)
-    walks = [np.concatenate([images[0][:, :296], np.roll(wall, 3 * i, 0)], axis=1) for i in range(len(times))]
+    wall = rng.integers(0, 255, (90, 12)).astype(np.uint8)
+    walks = [np.concatenate([images[0][:, :148], np.roll(wall, 2 * i, 0)], axis=1) for i in range(len(times))]
     views["03"] = camera, walks, times
     assert by_motion(views)["03"].doubt
 

@@ -207,9 +207,7 @@ def _sides(rig: SolvedRig, board: Board, corners: Mapping[str, Corners]) -> list
         features[name] = Features(pixels, np.zeros((len(places), 128), np.float32), np.zeros(len(places), int))
     bundle = fitting(triangulate(rig.cameras, features, Tracks(names, rows)), features, CORNER_ERROR)
     where = {tuple(row): number for row, number in zip(rows.tolist(), numbers, strict=True)}
-    points = {}
-    for point, row in zip(bundle.points, bundle.tracks.seen.tolist(), strict=True):
-        if tuple(row) in where:
-            points[where[tuple(row)]] = point
+    seen = map(tuple, bundle.tracks.seen.tolist())
+    points = {where[row]: point for point, row in zip(bundle.points, seen, strict=True) if row in where}
     neighbours = [(n, n + 1) for n in points if (n + 1) % across] + [(n, n + across) for n in points]
     return [float(np.linalg.norm(points[a] - points[b])) for a, b in neighbours if a in points and b in points]

@@ -137,7 +137,11 @@ def adjust(bundle: Bundle, features: Mapping[str, Features], scale: float, focal
     rec = pycolmap.Reconstruction()
     for name, number in numbers.items():
         lens = 1 if focal == "shared" else number
-        _add_camera(pycolmap, rec, bundle.cameras[name], (number, lens), features[name].pixels, focal is not None)
+        if lens not in rec.cameras:
+            rec.add_camera_with_trivial_rig(as_colmap(bundle.cameras[name], lens, focal is not None))
+        T, pixels = bundle.cameras[name].T_camera_world, features[name].pixels.reshape(-1, 2)
+        image = pycolmap.Image(name=name, keypoints=pixels, camera_id=lens, image_id=number)
+        rec.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(T[:3, :3]), T[:3, 3]))
     columns = [(numbers[name], place) for place, name in enumerate(bundle.tracks.names) if name in numbers]
     for point, seen in zip(bundle.points, bundle.tracks.seen.tolist(), strict=True):
         elements = [pycolmap.TrackElement(number, seen[place]) for number, place in columns if seen[place] >= 0]
@@ -147,18 +151,6 @@ def adjust(bundle: Bundle, features: Mapping[str, Features], scale: float, focal
     cameras = {name: _moved(bundle.cameras[name], rec, number, focal is not None) for name, number in numbers.items()}
     points = np.array([rec.points3D[i].xyz for i in identities]).reshape(-1, 3)
     return Bundle(cameras, points, bundle.tracks)
-
-
-def _add_camera(
-    pycolmap: ModuleType, rec: Any, camera: Camera, numbers: tuple[int, int], pixels: np.ndarray, focal: bool
-) -> None:
-    """Add an image with (its number, that of its lens), and the lens where it is not there yet."""
-    number, lens = numbers
-    if lens not in rec.cameras:
-        rec.add_camera_with_trivial_rig(as_colmap(camera, lens, focal))
-    image = pycolmap.Image(name=camera.name, keypoints=pixels.reshape(-1, 2), camera_id=lens, image_id=number)
-    T = camera.T_camera_world
-    rec.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(T[:3, :3]), T[:3, 3]))
 
 
 def _solve(pycolmap: ModuleType, rec: Any, scale: float, focal: bool) -> None:

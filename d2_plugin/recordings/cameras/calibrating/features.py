@@ -120,13 +120,10 @@ def _match(one: Features, other: Features) -> np.ndarray:
         near, second = (np.sqrt(np.maximum(2 - 2 * product, 0)) for product in (first, products.max(axis=1)))
         good = mutual & (near < RATIO * second)
         matches.append(np.stack([rows[good], columns[best[1][good]]], axis=1))
-    return _distinct(np.concatenate(matches), one, other)
-
-
-def _distinct(matches: np.ndarray, one: Features, other: Features) -> np.ndarray:
-    """Each pair of places once: SIFT puts several features with different orientations at one place."""
-    places = np.hstack([one.pixels[matches[:, 0]], one.moments[matches[:, :1]], other.pixels[matches[:, 1]]])
-    return matches[np.unique(places, axis=0, return_index=True)[1]]
+    found = np.concatenate(matches)
+    # Each pair of places once: SIFT puts several features with different orientations at one place.
+    places = np.hstack([one.pixels[found[:, 0]], one.moments[found[:, :1]], other.pixels[found[:, 1]]])
+    return found[np.unique(places, axis=0, return_index=True)[1]]
 
 
 def pixel_error(camera: Camera) -> float:

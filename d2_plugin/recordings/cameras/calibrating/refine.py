@@ -184,9 +184,8 @@ def _matches_of(name: str, matches: Matches) -> Matches:
 
 def _misses(name: str, cameras: Mapping[str, Camera], matches: Matches, features: Mapping[str, Features]) -> float:
     own = _places(_matches_of(name, matches), features)
-    return float(
-        np.median(np.abs(np.concatenate([sampson(cameras[a], cameras[b], *ends) for (a, b), ends in own.items()])))
-    )
+    missed = np.concatenate([sampson(cameras[a], cameras[b], *ends) for (a, b), ends in own.items()])
+    return float(np.median(np.abs(missed)))
 
 
 def refine_poses(given: Mapping[str, Camera], features: Mapping[str, Features]) -> RefinedPoses:

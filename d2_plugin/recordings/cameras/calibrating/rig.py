@@ -111,9 +111,7 @@ def aligned(cameras: Mapping[str, Camera], onto: Mapping[str, Camera]) -> dict[s
 def differences(cameras: Mapping[str, Camera], onto: Mapping[str, Camera]) -> dict[str, tuple[float, float]]:
     """Camera -> (degrees, share of the rig's width) that it differs by, once the rigs are laid over each other."""
     width = rig_width(onto.values()) or 1.0
-    laid = aligned(cameras, onto)
-    apart = {}
-    for name in laid:
-        degrees = degrees_between(laid[name], onto[name])
-        apart[name] = (degrees, float(np.linalg.norm(laid[name].centre - onto[name].centre) / width))
-    return apart
+    return {
+        name: (degrees_between(one, onto[name]), float(np.linalg.norm(one.centre - onto[name].centre) / width))
+        for name, one in aligned(cameras, onto).items()
+    }

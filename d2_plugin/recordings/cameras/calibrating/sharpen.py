@@ -56,13 +56,11 @@ def sharpened(
         for one, other in permutations(range(len(tracks.names)), 2):
             rows = np.flatnonzero((moments == moment) & (first == one) & (seen[:, other] >= 0))
             if len(rows):
-                names = tracks.names[one], tracks.names[other]
-                limit = LARGEST_MOVE * pixel_error(cameras[names[1]])
+                staying, moving = tracks.names[one], tracks.names[other]
+                limit = LARGEST_MOVE * pixel_error(cameras[moving])
                 pairs = seen[rows][:, [one, other]]
-                places, good = _moved(
-                    features[names[0]], features[names[1]], pairs, fine(names[0]), fine(names[1]), limit
-                )
-                moved[names[1]][seen[rows, other]] = places
+                places, good = _moved(features[staying], features[moving], pairs, fine(staying), fine(moving), limit)
+                moved[moving][seen[rows, other]] = places
                 seen[rows[~good], other] = -1
     better = {name: replace(features[name], pixels=moved[name]) for name in tracks.names}
     return {**features, **better}, Tracks(tracks.names, seen[(seen >= 0).sum(axis=1) >= 2])

@@ -251,9 +251,8 @@ def read_opencv(document: Document) -> Cameras:
         return None
     cameras = []
     for number, pose in poses.items():
-        K, distortion = (
-            matrix_of(table, key.format(number), shape, place) for key, shape in zip(names, ((3, 3), (-1,)))
-        )
-        lens = (K, "opencv", distortion.ravel(), pose[:3, :3], pose[:3, 3])
+        K = matrix_of(table, names[0].format(number), (3, 3), place)
+        distortion = matrix_of(table, names[1].format(number), (-1,), place)
+        lens = (K, "opencv", distortion, pose[:3, :3], pose[:3, 3])
         cameras.append(_camera(f"cam{number}", f"camera {number} in {place}", (0, 0), *lens))
     return cameras
