@@ -18,14 +18,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from d2_plugin.backbones.gaussians import appended, replaced, with_rows
 from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.rotation4d import identities, unit_quaternions
 from d2_plugin.gaussians.spherical_harmonics import coefficients_from_rgb
 from d2_plugin.protocol import Points, RasterSettings, Splats, View
 
 from .keys import ViewsByPose
-from .shared import Renders, Resizing, finite, on_device, seen_colors, splats_of
+from .shared import Renders, Resizing, appended, finite, on_device, replaced, seen_colors, splats_of, with_rows
 
 ROWS = "d2_rows"
 """The column in the strategy's state: the number of each row plus one, since gsplat marks what is new with zeros."""
@@ -199,12 +198,7 @@ class GsplatAdapter(Resizing):
         if numbers is not None and numbers is self._seen and numbers._version == self._version:
             return  # the very tensor that was there, and nobody wrote into it: no need to wait for the device
         if numbers is None or len(numbers) != self._count:
-            # Growth means appended rows (gsplat's sample_add); D2Hooks notices shrinking.
-            known = self._known
-            if self._count != known:
-                self._renumber()
-            if self._count > known:
-                self._report(appended(known, self._count, self.parameters["means"].device))
+            self._report_growth()
         elif len(numbers) != self._known or not torch.equal(numbers, self._numbers()):
             index = _first_occurrences(numbers - 1)
             self._renumber()
@@ -215,6 +209,13 @@ class GsplatAdapter(Resizing):
     def _see(self, numbers: Tensor) -> None:
         assert self.state is not None
         self.state[ROWS], self._seen, self._version = numbers, numbers, numbers._version
+
+    def _report_growth(self) -> None:
+        """Without row numbers: growth means appended rows (gsplat's sample_add); D2Hooks notices shrinking."""
+        if self._count != (known := self._known):
+            self._renumber()
+            if self._count > known:
+                self._report(appended(known, self._count, self.parameters["means"].device))
 
     def _renumber(self) -> None:
         self._known = self._count

@@ -19,7 +19,6 @@ from typing import Any, ClassVar, NamedTuple
 import torch
 from torch import Tensor
 
-from d2_plugin.backbones.gaussians import appended
 from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.rotation4d import identities
 from d2_plugin.gaussians.spherical_harmonics import coefficients_from_rgb
@@ -29,7 +28,7 @@ from d2_plugin.rasterizer import rasterize
 from .cameras import inria_view
 from .keys import KeyOf, PriorKey, key_from_image_name
 from .probe import Probe, probe_package
-from .shared import Renders, Resizing, finite, on_device, optional, seen_colors, steps_of_adam
+from .shared import Renders, Resizing, appended, finite, on_device, optional, seen_colors, steps_of_adam
 
 log = logging.getLogger(__name__)
 

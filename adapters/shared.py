@@ -135,3 +135,32 @@ def seen_colors(
     centre = -view.T_camera_world[:3, :3].T @ view.T_camera_world[:3, 3]
     chosen = harmonics[splats.rows, : channel_count(degree, time_degree)]
     return harmonic_colors(chosen, splats.means - centre, phase, degree, time_degree)
+
+
+def appended(before: int, after: int, device: torch.device) -> Tensor:
+    """The index of a change that appends rows at the end."""
+    index = torch.arange(after, device=device)
+    index[before:] = -1
+    return index
+
+
+def with_rows(optimizer: torch.optim.Optimizer, old: Tensor, rows: Tensor) -> torch.nn.Parameter:
+    """A parameter with new rows at the end in the place of `old` in its optimizer, with moments of zero there."""
+    grown = torch.cat([old.detach(), rows.to(old)])
+    return replaced(optimizer, old, grown, lambda moment: torch.cat([moment, torch.zeros_like(rows).to(moment)]))
+
+
+def replaced(
+    optimizer: torch.optim.Optimizer, old: Tensor, values: Tensor, change: Callable[[Tensor], Tensor]
+) -> torch.nn.Parameter:
+    """A parameter with these values in the place of `old` in its optimizer, whose moments of rows are changed."""
+    new = torch.nn.Parameter(values, requires_grad=old.requires_grad)
+    moments = optimizer.state.pop(old, {})
+    for name, value in moments.items():
+        if isinstance(value, Tensor) and value.shape[:1] == old.shape[:1] and name != "step":
+            moments[name] = change(value)
+    if moments:
+        optimizer.state[new] = moments
+    for group in optimizer.param_groups:
+        group["params"] = [new if parameter is old else parameter for parameter in group["params"]]
+    return new

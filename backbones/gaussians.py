@@ -43,15 +43,15 @@ class Gaussians:
     def append(self, rows: Mapping[str, Tensor]) -> None:
         """Add K rows (each tensor [K, ...]) at the end; their moments and statistics are zero."""
         count = len(next(iter(rows.values())))
-        for name, old in self.parameters.items():
-            self.parameters[name] = with_rows(self.optimizer, old, rows[name])
+        for name in self.parameters:
+            self._replace(name, lambda old, new=rows[name]: torch.cat([old, new.to(old)]), zeros=rows[name])
         for name, value in self.statistics.items():
             self.statistics[name] = torch.cat([value, value.new_zeros(count, *value.shape[1:])])
 
     def select(self, index: Tensor) -> None:
         """Keep the rows `index` (int64 [K], in this order), their moments and statistics."""
-        for name, old in self.parameters.items():
-            self.parameters[name] = replaced(self.optimizer, old, old.detach()[index], lambda moment: moment[index])
+        for name in self.parameters:
+            self._replace(name, lambda old: old[index])
         self.statistics = {name: value[index] for name, value in self.statistics.items()}
 
     def state_dict(self) -> dict[str, Any]:
@@ -65,36 +65,24 @@ class Gaussians:
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from `state_dict()`, whatever the present number of Gaussians."""
         for name, value in state["parameters"].items():
-            old = self.parameters[name]
-            self.parameters[name] = replaced(self.optimizer, old, value.to(old), lambda moment: moment)
+            self._replace(name, lambda old, new=value: new.to(old), keep_moments=False)
         self.statistics = {name: value.to(self.device, copy=True) for name, value in state["statistics"].items()}
         self.optimizer.load_state_dict(state["optimizer"])
 
-
-def appended(before: int, after: int, device: torch.device) -> Tensor:
-    """The index of a change that appends rows at the end."""
-    index = torch.arange(after, device=device)
-    index[before:] = -1
-    return index
-
-
-def with_rows(optimizer: torch.optim.Optimizer, old: Tensor, rows: Tensor) -> nn.Parameter:
-    """A parameter with new rows at the end in the place of `old` in its optimizer, with moments of zero there."""
-    grown = torch.cat([old.detach(), rows.to(old)])
-    return replaced(optimizer, old, grown, lambda moment: torch.cat([moment, torch.zeros_like(rows).to(moment)]))
-
-
-def replaced(
-    optimizer: torch.optim.Optimizer, old: Tensor, values: Tensor, change: Callable[[Tensor], Tensor]
-) -> nn.Parameter:
-    """A parameter with these values in the place of `old` in its optimizer, whose moments of rows are changed."""
-    new = nn.Parameter(values, requires_grad=old.requires_grad)
-    moments = optimizer.state.pop(old, {})
-    for name, value in moments.items():
-        if isinstance(value, Tensor) and value.shape[:1] == old.shape[:1] and name != "step":
-            moments[name] = change(value)
-    if moments:
-        optimizer.state[new] = moments
-    for group in optimizer.param_groups:
-        group["params"] = [new if parameter is old else parameter for parameter in group["params"]]
-    return new
+    @torch.no_grad()
+    def _replace(
+        self, name: str, change: Callable[..., Tensor], zeros: Tensor | None = None, keep_moments: bool = True
+    ) -> None:
+        """Swap one Parameter for a changed one, its Adam moments changed alike (`zeros`: rows appended with none)."""
+        old = self.parameters[name]
+        new = nn.Parameter(change(old.detach()).contiguous())
+        moments = self.optimizer.state.pop(old, None)
+        if moments and keep_moments:
+            for key in ("exp_avg", "exp_avg_sq"):
+                value = moments[key]
+                moments[key] = change(value) if zeros is None else torch.cat([value, torch.zeros_like(zeros).to(value)])
+            self.optimizer.state[new] = moments
+        for group in self.optimizer.param_groups:
+            if group["name"] == name:
+                group["params"][0] = new
+        self.parameters[name] = new

@@ -20,7 +20,7 @@ from d2_plugin.settings import LearningRate, Range, Settings
 from .appearance import Appearance, changed
 from .background import Background
 from .densify import DensifySettings, densify
-from .gaussians import Gaussians, appended
+from .gaussians import Gaussians
 from .starting import nearest_neighbour_scales
 
 STATISTICS = ("screen_gradient", "seen")
@@ -275,7 +275,9 @@ class SplatModel(ABC):
         """Add Gaussians (raw rows by name, [K, ...]) at the end. All growth goes through here."""
         before = len(self)
         self.gaussians.append(rows)
-        self._report_resize(appended(before, len(self), self.gaussians.device))
+        index = torch.arange(len(self), device=self.gaussians.device)
+        index[before:] = -1
+        self._report_resize(index)
 
     def select(self, index: Tensor) -> None:
         """Keep the rows `index`. All shrinking and reordering goes through here."""

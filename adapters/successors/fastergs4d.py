@@ -16,7 +16,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from d2_plugin.backbones.gaussians import appended, with_rows
 from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.rotation4d import identities
 from d2_plugin.gaussians.slicing import slice_gaussians
@@ -24,7 +23,7 @@ from d2_plugin.gaussians.spherical_harmonics import coefficients_from_rgb
 from d2_plugin.protocol import Points, RasterSettings, Splats, View
 
 from ..keys import KeyOf, PriorKey, key_from_image_name
-from ..shared import Resizing, finite, on_device, optional, seen_colors
+from ..shared import Resizing, appended, finite, on_device, optional, seen_colors, with_rows
 
 CONSTANTS = RasterSettings(alpha_max=1 - 1e-6)
 """Of its rasterizer (rasterization_config.h): alpha is not clamped; near comes from the camera."""
