@@ -21,6 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from d2_plugin.priors.evidence import AT_BEST
 from d2_plugin.priors.geometry import view_pair
 from d2_plugin.priors.monocular.align import INLIER_ERROR, SEED, Alignment, AlignStatus, predicted
 from d2_plugin.recordings.recording import Camera, MonoKind
@@ -37,8 +38,6 @@ FINER = 9
 LEANING = 0.03
 """Share of the objective that a slope e times the unit or a e-th of it costs: cameras of one height see the same of a
 floor with every slope, and a map is nearer to what it says of itself than to nothing at all."""
-SUREST = 0.01
-"""Maps bent by the anchors of one scene are not known better than that, however well they fit each other."""
 LEAST_REACH = 0.05
 """Anchors nearer than this to the smallest values of an inverse map, as a share of its span, count as so far off."""
 SAMPLES = 5000
@@ -87,7 +86,7 @@ def aligned_across(views: Mapping[str, Shown], kind: MonoKind) -> dict[str, Alig
         fits = {name: _agreement(name, maps, lines) for name in maps}
         worst = min(wanted, key=lambda name: fits[name].matched)
         if fits[worst].matched >= MATCHED:
-            spreads = {name: max(fit.spread, SUREST) for name, fit in fits.items() if fit.matched >= MATCHED}
+            spreads = {name: max(fit.spread, AT_BEST) for name, fit in fits.items() if fit.matched >= MATCHED}
             alignments = {name: replace(views[name].alignment, across=spread) for name, spread in spreads.items()}
             shared = {name: _through(alignments[name], views[name], lines[name], kind) for name in wanted}
             return alignments | shared
@@ -248,6 +247,7 @@ def _first_two(maps: Mapping[str, _Map], wanted: Sequence[str]) -> dict[str, flo
 
 
 def _leaning(slopes: np.ndarray) -> np.ndarray:
+    """What is left of the objective at slopes [n], in units, for how far they are from 1."""
     return 1 - LEANING * np.abs(np.log(slopes))
 
 

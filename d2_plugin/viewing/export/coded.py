@@ -103,7 +103,10 @@ def code_keys(keys: Keys, harmonics: Harmonics) -> CodedScene:
     own = harmonics._replace(coefficients=harmonics.coefficients[keys.rows])
     arrays = [*_code_state(keys.start), *_code_colors(own)]
     for i, state in enumerate(keys.states):
-        arrays += _code_state(state, f"_{i}")[: 3 if keys.changing else 1]
+        arrays.append(encode(f"positions_{i}", state.positions.numpy()))
+        if keys.changing:
+            arrays.append(encode(f"shapes_{i}", _shapes(state.factors), LOOK_BITS))
+            arrays.append(encode(f"opacities_{i}", state.opacities.numpy()))
     return CodedScene(arrays, len(keys.rows), "keys", keys)
 
 
@@ -126,11 +129,11 @@ def seen_rows(gaussians: MovingGaussians, duration: float) -> Tensor:
     return (finite & (strongest >= ALPHA_MIN)).nonzero()[:, 0]
 
 
-def _code_state(state: State, key: str = "") -> list[Coded]:
+def _code_state(state: State) -> list[Coded]:
     return [
-        encode(f"positions{key}", state.positions.numpy()),
-        encode(f"shapes{key}", _shapes(state.factors), LOOK_BITS),
-        encode(f"opacities{key}", state.opacities.numpy()),
+        encode("positions", state.positions.numpy()),
+        encode("shapes", _shapes(state.factors), LOOK_BITS),
+        encode("opacities", state.opacities.numpy()),
     ]
 
 

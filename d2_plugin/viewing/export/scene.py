@@ -13,7 +13,6 @@ from torch import Tensor
 
 from d2_plugin.gaussians.moving import Harmonics, MovingGaussians
 from d2_plugin.gaussians.spherical_harmonics import coefficients_from_rgb
-from d2_plugin.priors.geometry import projected
 from d2_plugin.protocol import Splats
 from d2_plugin.recordings import Camera
 from d2_plugin.viewing.camera_paths import Rig, at_pose
@@ -50,7 +49,13 @@ class ExportScene:
 
     def _seen_depth(self, camera: Camera, positions: Tensor) -> Tensor:
         """Depth [M] of positions [M, 3] in a camera; 0 for those outside of its image."""
-        _, depth, inside = map(torch.from_numpy, projected(camera, positions.numpy()))
+        pose, K = (torch.as_tensor(matrix).to(positions) for matrix in (camera.T_camera_world, camera.K))
+        points = positions @ pose[:3, :3].T + pose[:3, 3]
+        depth = points[:, 2]
+        pixels = (points[:, :2] * K.diagonal()[:2]) / depth.clamp(min=self.viewed.backbone.settings.near)[:, None] + K[
+            :2, 2
+        ]
+        inside = ((pixels > 0) & (pixels < pixels.new_tensor([camera.width, camera.height]))).all(1)
         return torch.where((depth > self.viewed.backbone.settings.near) & inside, depth, 0)
 
     @property
