@@ -242,6 +242,7 @@ class TestPrebuilt:
         wheel.mkdir()
         monkeypatch.setattr(prebuilt, "FOLDER", wheel)
         monkeypatch.setenv("PATH", "")
+        monkeypatch.delenv("CXX", raising=False)
         checksums = {}
         for level, library in libraries.items():
             path = wheel / prebuilt.file_name("answer", level, [source], [], [])

@@ -86,6 +86,7 @@ def test_the_unsynchronised_camera_of_coffee_martini_is_named(tmp_path: Path) ->
 
 
 def test_a_recording_has_the_same_cameras_and_images_in_both_layouts(tmp_path: Path) -> None:
+    pytest.importorskip("av")
     path = write_videos(recorded := smooth_recording(("00", "05")), save_recording(recorded, tmp_path / "scene"))
     folder = open_recording(path)
     videos = open_recording(path, layout="n3dv")
@@ -98,6 +99,7 @@ def test_a_recording_has_the_same_cameras_and_images_in_both_layouts(tmp_path: P
 
 
 def test_a_video_source_travels_to_another_process_and_ends_where_its_video_does(tmp_path: Path) -> None:
+    pytest.importorskip("av")
     video = write_videos(smooth_recording(("00",), frames=6), tmp_path) / "cam00.mp4"
     source = VideoFrames({"a": read_video(video)})
     first = source.image("a", 4)
