@@ -39,7 +39,7 @@ def share_contradicted(mono: np.ndarray, geometric: np.ndarray, tau_c: float | n
     """Of the geometric depths [H, W], 0 where there is none, how many the monocular ones contradict."""
     known = geometric > 0
     contradicted = known & ~(cross_source_discrepancy(mono, geometric) < tau_c)
-    return np.count_nonzero(contradicted) / max(np.count_nonzero(known), 1)
+    return int(np.count_nonzero(contradicted)) / max(int(np.count_nonzero(known)), 1)
 
 
 def hanging_pixels(mono: np.ndarray, limit: float) -> np.ndarray:
