@@ -44,6 +44,7 @@ def test_extracted_frames_are_found_in_every_usual_place(tmp_path: Path, pattern
     recording = open_recording(tmp_path)
     assert list(recording.cameras) == ["cam02", "cam13"]
     assert recording.frames == (0, 1)
+    assert any("30 taken" in note for note in recording.notes)
     assert recording.fps == 30
     assert recording.cameras["cam13"].centre[0] == pytest.approx(ROW[3] + 1)
     assert (recording.image("cam13", 1) == 101).all()

@@ -31,7 +31,7 @@ from d2_plugin.recordings.recording import Recording
 
 POSES = "poses_bounds.npy"
 
-N3DV_FPS = 30.0  # frame rate of the data set, where no video says it
+N3DV_FPS = 30.0  # frame rate of the data set, where no video says it, with a note
 
 UNSYNCHRONISED = {"coffee_martini": ("cam13",)}
 """Cameras whose video is not synchronised with the others. MixVoxels and K-Planes leave them out, too."""
@@ -70,7 +70,8 @@ def open_n3dv(path: Path, cameras: tuple[str, ...] | None = None, intersect: boo
         frames, more = common_frames(images, path)
         sizes = {name: image_size(images[name][frames[0]]) for name in names}
         calibrated = {name: camera_from_row(rows[name], name, sizes[name], where) for name in names}
-        return assembled(path, calibrated, images, frames, N3DV_FPS, where, (*notes, *more))
+        rate = (f"extracted frames name no fps: {N3DV_FPS:g} taken, as the data set has",) if len(frames) > 1 else ()
+        return assembled(path, calibrated, images, frames, N3DV_FPS, where, (*notes, *more, *rate))
     files = {name: read_video(videos[name]) for name in names}
     frames, more = common_frames({name: range(len(file.stamps)) for name, file in files.items()}, path)
     pinholes = {name: camera_from_row(rows[name], name, files[name].size, where).pinhole(where) for name in names}
