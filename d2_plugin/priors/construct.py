@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from d2_plugin.priors.evidence import AT_BEST, with_evidence
-from d2_plugin.priors.fuse import fuse, hanging_pixels, share_contradicted, with_matches
+from d2_plugin.priors.fuse import fuse, hanging_pixels, with_matches
 from d2_plugin.priors.maps_on_disk import divided, planar
 from d2_plugin.priors.monocular.across import Shown, aligned_across
 from d2_plugin.priors.monocular.align import Alignment, AlignStatus, align, aligned_depth, aligned_inverse, not_aligned
@@ -28,7 +28,7 @@ from d2_plugin.protocol import Label
 from d2_plugin.recordings.recording import Camera, MonoKind
 from d2_plugin.store.maps import FusedPrior, empty_prior
 
-CONSTRUCTION_VERSION = 19  # raise it when alignment or fusion change what they return
+CONSTRUCTION_VERSION = 18  # raise it when alignment or fusion change what they return
 
 FARTHEST = 3.0
 """Aligned monocular depth beyond this multiple of the 99.5 percentile of the anchors is left empty."""
@@ -221,6 +221,8 @@ def _view_prior(prepared: _Prepared, several: _Prepared | None, settings: PriorS
     multi = None if several is None else _aligned(several, settings)
     both = mono if multi is None else _voted(mono, multi, prepared, settings)
     maps = _fused(both, prepared, settings)
+    if settings.agreement > 0 and settings.variant == "dual" and view.geometric and both.uncertainty:
+        maps = with_matches(maps, both.depth, both.uncertainty.sigma, view.geometric.unconfirmed)
     if settings.far and settings.variant == "dual" and not mono.refused:
         maps = _with_far(maps, mono, prepared)
     if view.recorded is not None:
@@ -294,7 +296,7 @@ def _fused(mono: _AlignedMap, prepared: _Prepared, settings: PriorSettings) -> F
     alone, at_anchors = (unknown, unknown) if mono.uncertainty is None else mono.uncertainty[:2]
     # A map that was not aligned has no sigma to verify by: that row of the paper's table keeps its fixed threshold.
     allowed = settings.conflict_sigmas * np.sqrt(at_anchors * at_anchors + prepared.sigma * prepared.sigma)
-    maps = fuse(
+    return fuse(
         mono.depth,
         prepared.depth,
         tau_c=settings.tau_c if variant == "dual_unaligned" else allowed,
@@ -304,12 +306,6 @@ def _fused(mono: _AlignedMap, prepared: _Prepared, settings: PriorSettings) -> F
         sigma_mono=alone,
         sigma_geometric=prepared.sigma,
     )
-    geometric = prepared.view.geometric
-    if geometric is None or variant not in ("dual", "mvs") or settings.agreement == 0:
-        return maps
-    # A good map knows more than the odds do: likely matches are taken beside a map that contradicts good ones alone.
-    heard = variant == "dual" and share_contradicted(mono.depth, prepared.depth, allowed) <= settings.most_vetoed
-    return with_matches(maps, mono.depth, alone, geometric.unconfirmed, unknown if heard else geometric.sigma)
 
 
 def _within(maps: FusedPrior, recorded: np.ndarray) -> FusedPrior:

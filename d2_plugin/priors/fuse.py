@@ -35,13 +35,6 @@ def cross_source_discrepancy(mono: np.ndarray, geometric: np.ndarray) -> np.ndar
     return np.where(known, relative, np.inf).astype(np.float32)
 
 
-def share_contradicted(mono: np.ndarray, geometric: np.ndarray, tau_c: float | np.ndarray) -> float:
-    """Of the geometric depths [H, W], 0 where there is none, how many the monocular ones contradict."""
-    known = geometric > 0
-    contradicted = known & ~(cross_source_discrepancy(mono, geometric) < tau_c)
-    return int(np.count_nonzero(contradicted)) / max(int(np.count_nonzero(known)), 1)
-
-
 def hanging_pixels(mono: np.ndarray, limit: float) -> np.ndarray:
     """Pixels [H, W] bool of a monocular map that hang between a near and a far surface; an addition to the paper.
 
@@ -100,9 +93,10 @@ def fuse(
     elif variant == "dual_unverified":
         verified = geometric > 0
     else:
+        known = geometric > 0
         verified = cross_source_discrepancy(mono, geometric) < tau_c  # Omega^v, within Omega^g
-        if share_contradicted(mono, geometric, tau_c) > most_vetoed:
-            verified = geometric > 0
+        if np.count_nonzero(known & ~verified) > most_vetoed * np.count_nonzero(known):
+            verified = known
     depth, labels = _labelled(alone, geometric, verified)
     if sigma_mono is None or sigma_geometric is None:
         return FusedPrior(depth, labels, np.where(labels == Label.VERIFIED, 0, np.inf).astype(np.float32))
@@ -110,26 +104,21 @@ def fuse(
     return FusedPrior(depth, labels, np.where(depth > 0, sigma, np.float32(np.inf)).astype(np.float32, copy=False))
 
 
-def with_matches(
-    maps: FusedPrior, mono: np.ndarray, sigma: np.ndarray, unconfirmed: np.ndarray, own: np.ndarray
-) -> FusedPrior:
+def with_matches(maps: FusedPrior, mono: np.ndarray, sigma: np.ndarray, unconfirmed: np.ndarray) -> FusedPrior:
     """D* with the matches that the monocular map confirms where no other view does; an addition to the paper.
 
     A match (all maps are float [H, W], depths 0 where there is none) near `mono` is verified, as the paper has it, and
     takes the place of the map's depth, which is not as exact, or of nothing, at an edge that the map blurs. Its sigma
-    says that it had one witness: a share of the relative `sigma` of the map and of how far the two are apart. One with
-    a finite sigma of its `own` needs no witness.
+    says that it had one witness: a share of the relative `sigma` of the map and of how far the two are apart.
     """
     known = (mono > 0) & (unconfirmed > 0) & (sigma < np.inf)
     apart = np.abs(np.log(np.where(known, unconfirmed, 1) / np.where(known, mono, 1)))
-    near = known & (apart < np.fmin(CONFIRMS * sigma, NEAR))
-    found = near | ((unconfirmed > 0) & (own < np.inf))
-    witnessed = np.where(near, np.fmax(np.float32(SURER) * (sigma + apart), np.float32(SUREST)), np.float32(np.inf))
+    found = known & (apart < np.fmin(CONFIRMS * sigma, NEAR))
     return replace(
         maps,
         depth=np.where(found, unconfirmed, maps.depth),
         labels=np.where(found, np.uint8(Label.VERIFIED), maps.labels),
-        sigma=np.where(found, np.fmin(witnessed, own), maps.sigma),
+        sigma=np.where(found, np.fmax(np.float32(SURER) * (sigma + apart), np.float32(SUREST)), maps.sigma),
     )
 
 

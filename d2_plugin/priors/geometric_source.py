@@ -21,11 +21,11 @@ from d2_plugin.recordings.recording import Camera
 from d2_plugin.store.files import Entry, EntryFolder, hash_of
 from d2_plugin.store.maps import SIGMA, DepthRange, encode_sigma
 
-VERSION = 13  # raise it when a matcher or the filter changes what it returns, so that caches are not trusted
+VERSION = 12  # raise it when a matcher or the filter changes what it returns, so that caches are not trusted
 
-STEREO_DTYPE = np.dtype([("depth", "<u2"), ("sigma", "u1"), ("kept", "?")])
+STEREO_DTYPE = np.dtype([("depth", "<u2"), ("sigma", "u1")])
 """Geometric depth as it is stored, pixel by pixel: logarithms, in 16 and in 8 bits. Matches that nobody confirms stand
-between, and are not kept."""
+between, with an infinite sigma."""
 
 
 class GeometricSource(ABC):
@@ -92,7 +92,6 @@ class GeometricSource(ABC):
         about = {"key": key, "matcher": self.matcher, "depth_range": [depth_range.near, depth_range.far]}
         codes = np.empty(depth.depth.shape, STEREO_DTYPE)
         codes["depth"], codes["sigma"] = depth_range.encode(matched), encode_sigma(depth.sigma)
-        codes["kept"] = depth.depth > 0
         return _decoded(codes, self.entries.write(camera, frame, codes, about | depth.record))
 
 
@@ -102,5 +101,6 @@ def stored_depth(entry: Entry) -> GeometricDepth:
 
 
 def _decoded(codes: np.ndarray, record: dict[str, Any]) -> GeometricDepth:
-    matched, kept = DepthRange(*record["depth_range"]).decode(codes["depth"]), codes["kept"]
-    return GeometricDepth(matched * kept, SIGMA[codes["sigma"]], matched * ~kept, record)
+    matched, sigma = DepthRange(*record["depth_range"]).decode(codes["depth"]), SIGMA[codes["sigma"]]
+    confirmed = sigma < np.inf
+    return GeometricDepth(matched * confirmed, sigma, matched * ~confirmed, record)

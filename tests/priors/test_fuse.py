@@ -109,7 +109,7 @@ def test_a_match_that_no_view_confirms_counts_where_the_map_does_as_far_as_the_m
     hanging = np.arange(8)[None] == 7
     uncertain = {"sigma_mono": sigma, "sigma_geometric": np.where(geometric > 0, np.float32(0.001), np.float32(np.inf))}
     fused = fuse(mono, geometric, tau_c=0.1, hanging=hanging, **uncertain)
-    found = with_matches(fused, mono, sigma, unconfirmed, np.full_like(sigma, np.inf))
+    found = with_matches(fused, mono, sigma, unconfirmed)
     taken = np.flatnonzero((found.depth != fused.depth)[0])
     assert taken.tolist() == [0, 7]
     np.testing.assert_array_equal(found.depth[0, taken], unconfirmed[0, taken])
@@ -119,21 +119,9 @@ def test_a_match_that_no_view_confirms_counts_where_the_map_does_as_far_as_the_m
     assert (found.sigma[0, taken] < sigma[0, taken]).all()
     for unit in (1e-30, 1e30):
         there = replace(fused, depth=fused.depth * np.float32(unit))
-        scaled = with_matches(there, mono * np.float32(unit), sigma, unconfirmed * np.float32(unit), np.inf)
+        scaled = with_matches(there, mono * np.float32(unit), sigma, unconfirmed * np.float32(unit))
         np.testing.assert_array_equal(scaled.labels, found.labels)
         np.testing.assert_allclose(scaled.sigma, found.sigma, rtol=1e-5)
-
-
-def test_a_likely_match_needs_no_map_where_the_map_has_no_say() -> None:
-    # Likely, likely and near the map, not likely, no match.
-    mono, sigma = np.float32([[3.0, 2.0, 3.0, 3.0]]), np.full((1, 4), np.float32(0.1))
-    unconfirmed, own = np.float32([[2.0, 2.0, 2.0, 0.0]]), np.float32([[0.01, 0.01, np.inf, np.inf]])
-    nothing = np.zeros_like(mono), np.full_like(mono, np.inf)
-    fused = fuse(mono, nothing[0], tau_c=0.1, sigma_mono=sigma, sigma_geometric=nothing[1])
-    found = with_matches(fused, mono, sigma, unconfirmed, own)
-    np.testing.assert_array_equal(found.labels == Label.VERIFIED, [[True, True, False, False]])
-    np.testing.assert_array_equal(found.depth, [[2, 2, 3, 3]])
-    np.testing.assert_array_equal(found.sigma, np.float32([[0.01, 0.01, 0.1, 0.1]]))
 
 
 def test_unknown_variants_and_unequal_sizes_are_refused() -> None:

@@ -86,8 +86,8 @@ def _filled(results: Sequence[GeometricDepth]) -> GeometricDepth:
     """The first of several results of one view, with what the later ones know where it is empty."""
     depth, sigma, unconfirmed = (map_.copy() for map_ in (results[0].depth, results[0].sigma, results[0].unconfirmed))
     for coarser in results[1:]:
-        found = (depth == 0) & (coarser.depth > 0)
-        depth[found], sigma[found] = coarser.depth[found], coarser.sigma[found]
+        empty = depth == 0
+        depth[empty], sigma[empty] = coarser.depth[empty], coarser.sigma[empty]
         unconfirmed = np.where(unconfirmed > 0, unconfirmed, coarser.unconfirmed)
     survivors = results[0].record["survivors"] | {"filled": int(np.count_nonzero(depth))}
     return GeometricDepth(depth, sigma, unconfirmed * (depth == 0), {"survivors": survivors})
@@ -134,10 +134,8 @@ def enlarged(result: GeometricDepth, width: int, height: int, tolerance: float =
 
     row, column = np.where(row_share < 0.5, rows[0], rows[1]), np.where(column_share < 0.5, columns[0], columns[1])
     depth = interpolated(result.depth)
-    unconfirmed = interpolated(result.unconfirmed)
-    known = (depth > 0) | (unconfirmed > 0)
-    sigma = np.where(known, result.sigma[row][:, column], np.float32(np.inf))
-    return replace(result, depth=depth, sigma=sigma, unconfirmed=unconfirmed)
+    sigma = np.where(depth > 0, result.sigma[row][:, column], np.float32(np.inf))
+    return replace(result, depth=depth, sigma=sigma, unconfirmed=interpolated(result.unconfirmed))
 
 
 def _neighbours(small: int, large: int) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:

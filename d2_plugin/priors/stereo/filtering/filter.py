@@ -15,7 +15,6 @@ import numpy as np
 
 from d2_plugin.priors.stereo.filtering import kernel
 from d2_plugin.priors.stereo.filtering.confirm import RELATIVE_DEPTH, confirm
-from d2_plugin.priors.stereo.filtering.likely import LOOSER, SIGMA, are_likely
 from d2_plugin.priors.stereo.filtering.precision import geometric_sigma, grey_gradient
 from d2_plugin.priors.stereo.settings import StereoSettings
 from d2_plugin.recordings.images import opencv
@@ -51,8 +50,8 @@ class GeometricDepth:
 
     `depth` [H, W] float32 is planar z, 0 where nothing survived (the complement of Omega^g); `sigma` [H, W] float32 is
     its relative standard deviation, infinite where there is none; `unconfirmed` [H, W] float32 are matches elsewhere
-    that may be right, 0 where there is none, with a finite sigma where they likely are; `record` is what is stored
-    beside them, as plain values: under `survivors` how many pixels were left after each test, in order.
+    that lack the word of another view alone, 0 where there is none; `record` is what is stored beside them, as plain
+    values: under `survivors` how many pixels were left after each test, in order.
     """
 
     depth: np.ndarray
@@ -90,8 +89,8 @@ def filter_depths(
     results = []
     for index, gray in enumerate(grays):
         confirmation = confirm(index, cameras, candidates, settings, tolerance)
-        needed = max(min(settings.min_sources, len(cameras) - 1), 1)
-        confirmed = candidates[index] * (confirmation.sources >= needed)
+        needed = min(settings.min_sources, len(cameras) - 1)
+        confirmed = candidates[index] * (confirmation.sources >= max(needed, 1))
         final = remove_speckles(confirmed, tolerance)
         survivors = {
             "pixels": gray.size,
@@ -103,11 +102,7 @@ def filter_depths(
         }
         evidence = (coherent[index], confirmation.parallax, confirmation.spread, grey_gradient(gray))
         sigma = geometric_sigma(final, *evidence)
-        plausible = textured[index] * ((coherent[index] >= PLAUSIBLE) & (final == 0))
-        loose = confirm(index, cameras, known, settings, LOOSER * tolerance).sources
-        likely = are_likely(known[index], final, coherent[index], loose * (loose >= needed))
-        likely &= remove_speckles(np.where(likely, known[index], final), tolerance) > 0
-        sigma, unconfirmed = np.where(likely, SIGMA, sigma), np.where(likely, known[index], plausible)
+        unconfirmed = textured[index] * ((coherent[index] >= PLAUSIBLE) & (final == 0))
         results.append(GeometricDepth(final, sigma, unconfirmed, {"survivors": survivors}))
     return results
 
