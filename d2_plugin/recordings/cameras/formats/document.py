@@ -83,7 +83,7 @@ class Document:
         plain_yaml = re.search(r"^[\w.-]+:(\s|$)", text, re.MULTILINE)
         if plain_yaml and not re.search(r"^[ \t]*\[", text, re.MULTILINE):
             return parse_yaml(text, self.place)
-        guess = "" if self.path.suffix == ".toml" else ", read as TOML since it is no XML, JSON or YAML,"
+        guess = "" if self.path.suffix == ".toml" else ", which looks like no XML, JSON or YAML,"
         return parse_toml(text, self.place + guess, CORRECT)
 
     @property
