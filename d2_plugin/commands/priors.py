@@ -67,7 +67,7 @@ def run(given: Given) -> str:
     calibration = held_against_truth(store, scene.recording, frames)
     if calibration is not None:
         show(str(calibration))
-    if summary.usable and can_decide(scene):
+    if summary.usable and can_decide(settings, scene):
         show(tried(settings, scene, points, folder)["text"])
     try:
         with in_turn(options.output):

@@ -106,8 +106,7 @@ class Run:
         """What trials showed of the prior, where that is left to them; a short run makes none."""
         settings = self.settings
         inserts = bool({"densify", "depth_loss"} & set(settings.hooks))
-        chosen = "believe" in settings.overrides.get("d2", {})
-        if self.guidance is not None or chosen or not inserts or not can_decide(self.scene):
+        if self.guidance is not None or not inserts or not can_decide(settings, self.scene):
             return None
         if settings.iterations < LEAST_ITERATIONS:
             return PriorStore.described(self.priors).tried()

@@ -80,7 +80,7 @@ def share(settings: RunSettings, folder: Path, cluster: Mapping[str, Any] | None
         build = partial(build_priors_for, scene, known.positions, shared.priors, cluster=cluster)
 
         def try_out(summary: PriorSummary) -> None:
-            if summary.usable and can_decide(scene):
+            if summary.usable and can_decide(settings, scene):
                 tried(settings, scene, known, shared.priors)  # counted with the runs that use it
 
         _timed(shared.priors, build, clock, try_out)

@@ -179,8 +179,10 @@ def test_other_depth_fills_the_gaps_without_parallax(settings, tmp_path, monkeyp
 
 def test_one_of_two_cameras_would_train_alone_so_two_cameras_get_no_trial(room: Path, tmp_path: Path) -> None:
     run = run_of(RunSettings(str(room), TRAINED), tmp_path / "run")
-    assert can_decide(run.scene)
-    assert not can_decide(replace(run.scene, train_cameras=TRAINED[:2]))
+    assert can_decide(run.settings, run.scene)
+    assert not can_decide(run.settings, replace(run.scene, train_cameras=TRAINED[:2]))
+    chosen = replace(run.settings, overrides={"d2": {"believe": "stereo"}})
+    assert not can_decide(chosen, run.scene), "in `d2 bench training` and `d2 priors` as in `d2 train`"
 
 
 def test_what_one_run_tried_serves_every_trainer_until_the_prior_changes(settings, tmp_path: Path, tried: list) -> None:

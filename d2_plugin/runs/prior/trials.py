@@ -93,10 +93,11 @@ def _mean(ssim: Mapping[str, float]) -> float:
     return float(np.mean(list(ssim.values())))
 
 
-def can_decide(scene: Scene) -> bool:
-    """Whether trials can say anything: two depth sources that both insert, and three cameras."""
+def can_decide(settings: RunSettings, scene: Scene) -> bool:
+    """Whether trials can say anything: nothing is chosen, two depth sources that both insert, and three cameras."""
+    chosen = "believe" in settings.overrides.get("d2", {})
     both = scene.plan.uses("verification") and scene.prior_settings.variant == "dual"
-    return both and len(scene.train_cameras) >= LEAST_CAMERAS
+    return not chosen and both and len(scene.train_cameras) >= LEAST_CAMERAS
 
 
 def tried(settings: RunSettings, scene: Scene, points: TimedPoints, priors: Path) -> dict[str, Any]:
