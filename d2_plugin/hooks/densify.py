@@ -134,8 +134,8 @@ def frustum_cells(view: View, points: Tensor, stride: float, depth_step: float) 
     image = (camera / safe[:, None]) @ K.T
     image = torch.where(inside[:, None], image, torch.zeros_like(image))
     column, row = (image[:, 0] / stride).long(), (image[:, 1] / stride).long()
-    layer = torch.floor(safe.double().log() / math.log1p(depth_step)).long() + (1 << 20)
-    key = (layer * (1 << 20) + row) * (1 << 20) + column
+    layer = torch.floor(safe.double().log() / math.log1p(depth_step)).long() + (1 << 27)  # 1e-6 deep: up to 2^27
+    key = (layer * (1 << 16) + row) * (1 << 16) + column
     return torch.where(inside, key, torch.full_like(key, -1))
 
 

@@ -17,7 +17,7 @@ from tiny import ALL_HOOKS, HEIGHT, WIDTH, TinyStore, make_adapter, make_model, 
 
 from d2_plugin import hooks
 from d2_plugin.config import DensifyConfig, PruneConfig
-from d2_plugin.hooks.densify import Densify, back_project
+from d2_plugin.hooks.densify import Densify, back_project, frustum_cells
 from d2_plugin.hooks.hook import Context, HookConfig
 from d2_plugin.hooks.prior import PriorLoader
 from d2_plugin.plugin import D2Hooks
@@ -34,6 +34,12 @@ def test_back_projection_of_a_projected_point_is_the_point() -> None:
     image = camera @ K.T
     torch.testing.assert_close(camera[:, 2], depth)
     torch.testing.assert_close(image[:, :2] / image[:, 2:] - 0.5, pixels.double())
+
+
+@pytest.mark.parametrize("unit", [1e-6, 1e-3, 1.0, 1e6])
+def test_cells_as_thin_as_the_least_tau_u_have_numbers_in_any_unit_of_length(unit: float) -> None:
+    near, far = frustum_cells(make_views()[1], unit * torch.tensor([[0.0, 0, 2], [0, 0, 3]]), 1.0, 1e-6).tolist()
+    assert 0 <= near < far
 
 
 KNOWN = HEIGHT * (WIDTH - 1)
