@@ -8,6 +8,7 @@ changes begin there, and a camera that does not train is shown with its own.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from copy import deepcopy
 from typing import Any
 
 import torch
@@ -68,7 +69,7 @@ class Appearance:
         """Changes and optimizers, by camera; those of cameras that do not train are measured and have none."""
         fixed = {camera: {"measured": value.clone()} for camera, value in self.measured.items()}
         return fixed | {
-            camera: {"change": value.detach().clone(), "optimizer": self._optimizers[camera].state_dict()}
+            camera: {"change": value.detach().clone(), "optimizer": deepcopy(self._optimizers[camera].state_dict())}
             for camera, value in self.changes.items()
         }
 
@@ -80,7 +81,7 @@ class Appearance:
                 self.measured[camera] = part["measured"].to(self.device).clone()
                 continue
             self._add(camera, part["change"].to(self.device).clone())
-            self._optimizers[camera].load_state_dict(part["optimizer"])
+            self._optimizers[camera].load_state_dict(deepcopy(part["optimizer"]))
 
     def _add(self, camera: str, change: Tensor) -> None:
         self.changes[camera] = nn.Parameter(change)

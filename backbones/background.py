@@ -9,6 +9,7 @@ no evaluation at each pixel: it is computed at a few directions and interpolated
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from copy import deepcopy
 from typing import Any
 
 import torch
@@ -122,7 +123,7 @@ class Background:
         return {
             "constant": self.constant.detach().clone(),
             "harmonics": self.harmonics.detach().clone(),
-            "optimizer": self.optimizer.state_dict(),
+            "optimizer": deepcopy(self.optimizer.state_dict()),
         }
 
     @torch.no_grad()
@@ -130,7 +131,7 @@ class Background:
         """Continue from `state_dict()`."""
         self.constant.copy_(state["constant"])
         self.harmonics.copy_(state["harmonics"])
-        self.optimizer.load_state_dict(state["optimizer"])
+        self.optimizer.load_state_dict(deepcopy(state["optimizer"]))
 
 
 def _nodes(view: View) -> tuple[int, int, int]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Mapping
+from copy import deepcopy
 from dataclasses import dataclass
 from typing import Any
 
@@ -153,7 +154,7 @@ class Deform(SplatModel):
         if self.field is not None:
             state |= {
                 "field": {name: value.clone() for name, value in self.field.state_dict().items()},
-                "field_optimizer": self.field_optimizer.state_dict(),
+                "field_optimizer": deepcopy(self.field_optimizer.state_dict()),
                 "generator": self._generator.get_state(),
                 "noise": self._noise,
             }
@@ -164,7 +165,7 @@ class Deform(SplatModel):
         super().load_state_dict(state["gaussians"])
         if self.field is not None:
             self.field.load_state_dict(state["field"])
-            self.field_optimizer.load_state_dict(state["field_optimizer"])
+            self.field_optimizer.load_state_dict(deepcopy(state["field_optimizer"]))
             self._generator.set_state(state["generator"].cpu())
             self._noise = state["noise"]
 

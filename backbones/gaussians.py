@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from copy import deepcopy
 from typing import Any
 
 import torch
@@ -59,15 +60,15 @@ class Gaussians:
         return {
             "parameters": {name: value.detach().clone() for name, value in self.parameters.items()},
             "statistics": {name: value.clone() for name, value in self.statistics.items()},
-            "optimizer": self.optimizer.state_dict(),
+            "optimizer": deepcopy(self.optimizer.state_dict()),
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from `state_dict()`, whatever the present number of Gaussians."""
         for name, value in state["parameters"].items():
-            self._replace(name, lambda old, new=value: new.to(old), keep_moments=False)
+            self._replace(name, lambda old, new=value: new.to(old, copy=True), keep_moments=False)
         self.statistics = {name: value.to(self.device, copy=True) for name, value in state["statistics"].items()}
-        self.optimizer.load_state_dict(state["optimizer"])
+        self.optimizer.load_state_dict(deepcopy(state["optimizer"]))
 
     @torch.no_grad()
     def _replace(

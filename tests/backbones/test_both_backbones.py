@@ -126,6 +126,12 @@ def test_a_resumed_run_is_bitwise_the_uninterrupted_one(backbone: str, config: D
     second.load_state_dict(torch.load(buffer, weights_only=True))
     second.run()
     assert same(parameters(whole), parameters(second))
+    state = first.state_dict()  # kept in memory while the run goes on, and continued from twice
+    first.run()
+    for again in (make_trainer(config, 20, backbone=backbone) for _ in range(2)):
+        again.load_state_dict(state)
+        again.run()
+        assert same(parameters(whole), parameters(again))
     assert whole.model.appearance.change("cam0").abs().max() > 0
 
 
