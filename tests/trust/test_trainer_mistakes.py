@@ -79,6 +79,13 @@ def test_some_pixels_of_a_prior_that_cannot_be_are_counted_once_per_camera(depth
 FIRST = VIEWS[0]
 
 
+def test_rounding_in_a_pose_and_a_frame_that_is_a_tensor_are_no_mistake() -> None:
+    d2, rounded = hooks(), FIRST.T_camera_world + torch.tensor([[0.0], [0], [0], [1.5e-8]])
+    for step in (1, 2):
+        d2.loss(step, replace(FIRST, frame=torch.tensor(FIRST.frame), T_camera_world=rounded))
+    assert len(d2.state_dict()["views"]["views"]) == 1
+
+
 @pytest.mark.parametrize(
     ("changes", "says"),
     [
