@@ -198,7 +198,7 @@ class StepOrder:
     def __init__(self) -> None:
         self.done, self.begun = -1, -1
         """The last step that `D2Hooks.step` ended, and the last one that either of the two was given."""
-        self._warned = False
+        self._warned, self._alone, self._ended = False, 0, False
 
     def check(self, step: int, ends: bool) -> None:
         """Warn, once, of a number out of its order; `ends` says that it is `D2Hooks.step`'s."""
@@ -210,7 +210,12 @@ class StepOrder:
                 "which rises from one to the next, or schedules run at other steps",
                 "step" if ends else "loss", step, self.begun,
             )  # fmt: skip
-        self.begun = step
+        self._alone = self._alone + (step != self.begun) if ends == self._ended else 0
+        if self._alone == 100:
+            _log.warning(
+                "d2.%s was not called in 100 steps: call d2.loss and d2.step in each", "loss" if ends else "step"
+            )
+        self.begun, self._ended = step, ends
         self.done = step if ends else self.done
 
 

@@ -134,6 +134,9 @@ def test_a_step_that_falls_repeats_or_differs_is_named_once(caplog: pytest.LogCa
         caplog.clear()
         after(*wrong, *wrong)
         assert caplog.text.count("which rises from one to the next") == 1
+    for one, other in (("loss", "step"), ("step", "loss")):
+        after(*((one, step) for step in range(1, 300)))
+        assert caplog.text.count(f"d2.{other} was not called in 100 steps") == 1
 
 
 @pytest.mark.parametrize(
