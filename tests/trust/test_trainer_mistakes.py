@@ -23,7 +23,7 @@ from d2_plugin.adapters.yang4d import Yang4DAdapter
 from d2_plugin.config import D2Config, DensifyConfig, DepthLossConfig, PruneConfig
 from d2_plugin.errors import D2Error
 from d2_plugin.plugin import D2Hooks
-from d2_plugin.protocol import DepthPrior, Splats
+from d2_plugin.protocol import DepthPrior, Edit, Splats
 
 VIEWS = make_views()
 
@@ -161,6 +161,13 @@ def inserting(said: object) -> D2Hooks:
     d2 = hooks(config=D2Config(densify=DensifyConfig(start=1, every=1)), adapter=adapter)
     d2.loss(1, VIEWS[0])
     return d2
+
+
+def test_a_remove_that_keeps_what_it_should_delete_is_refused() -> None:
+    adapter = make_adapter(make_model())
+    remove, edit = adapter.remove, Edit(remove=torch.arange(len(adapter)) % 3 == 0)
+    adapter.remove = lambda mask: remove(~mask)
+    refuses("mask of 20 Gaussians and took 40: True in it", hooks(adapter=adapter)._remove, 1, [("own", edit)])
 
 
 def test_an_insert_that_adds_nothing_is_named_once(caplog: pytest.LogCaptureFixture) -> None:
