@@ -322,8 +322,11 @@ class D2Hooks:
             return 0
         union = limited(torch.stack([mask for _, mask in masks]).any(0), self.config.remove_at_most, step)
         self.trace.extend(Trace(step, name, "remove", int((mask & union).sum())) for name, mask in masks)
+        before, removed = len(self.backbone), int(union.sum())
         self.backbone.remove(union)
-        return int(union.sum())
+        if (took := before - len(self.backbone)) != removed:
+            raise D2Error(f"remove() was given a mask of {removed} Gaussians and took {took}: True in it means delete")
+        return removed
 
     def _insert(self, step: int, edits: Sequence[tuple[str, Edit]]) -> int:
         proposals = [(name, edit.insert) for name, edit in edits if edit.insert is not None]
@@ -338,9 +341,7 @@ class D2Hooks:
         check_inserted(inserted, len(points.positions), len(self.backbone) - before)
         if not inserted and len(points.positions) and not self._idle_insert:
             self._idle_insert = True
-            _log.warning(
-                "insert() of the backbone added none of %d points: D2 densifies nothing", len(points.positions)
-            )
+            _log.warning("insert() of the backbone added none of %d points: D2 adds nothing", len(points.positions))
         self.trace.append(Trace(step, proposals[0][0], "insert", inserted))
         return inserted
 

@@ -6,6 +6,7 @@ import logging
 import operator
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -48,7 +49,7 @@ def check_backbone(backbone: object) -> None:
 
 
 def converted(backbone: Backbone, camera: object) -> View:
-    """The trainer's camera as a view."""
+    """The trainer's camera as a view, its frame a plain number: two tensors of one number would be two keys."""
     if camera is None:
         raise D2Error("d2.loss got None as a view: give the trainer's camera, or a list of them for a batch")
     try:
@@ -65,7 +66,7 @@ def converted(backbone: Backbone, camera: object) -> View:
             f"view() of {type(backbone).__name__} returned a {type(view).__name__}, expected d2_plugin.protocol.View: "
             "mend the adapter"
         )
-    return view
+    return replace(view, frame=view.frame.item()) if isinstance(view.frame, Tensor) and view.frame.ndim == 0 else view
 
 
 def check_view(view: View) -> None:
@@ -85,9 +86,10 @@ def check_view(view: View) -> None:
         raise D2Error(f"{name} has focal lengths {fx:g} and {fy:g}, expected positive pixels: correct the camera")
     if not (view.width >= 1 and view.height >= 1):
         raise D2Error(f"{name} has {view.width}x{view.height} pixels, expected at least one: correct the camera")
-    rotation, last = T[:3, :3].detach().double().cpu(), [*K[2].tolist(), *T[3].tolist()]
+    rotation, fixed = T[:3, :3].detach().double().cpu(), [float(K[1, 0]), *K[2].tolist(), *T[3].tolist()]
+    off = max(abs(got - must) for got, must in zip(fixed, (0, 0, 0, 1, 0, 0, 0, 1)))  # 1.5e-8 of an inverse in float32
     skewed = float((rotation @ rotation.T - torch.eye(3, dtype=torch.float64, device="cpu")).abs().max())
-    if skewed > SKEWED or float(torch.linalg.det(rotation)) < 0 or last != [0, 0, 1, 0, 0, 0, 1] or K[1, 0] != 0:
+    if skewed > SKEWED or float(torch.linalg.det(rotation)) < 0 or off > 1e-5:
         raise D2Error(
             f"T_camera_world of {name} is no rotation and shift, or K has a number below its diagonal, or the last row "
             "of one of them is not 0 ... 0 1: correct the camera"
@@ -196,7 +198,7 @@ class StepOrder:
     def __init__(self) -> None:
         self.done, self.begun = -1, -1
         """The last step that `D2Hooks.step` ended, and the last one that either of the two was given."""
-        self._warned = False
+        self._warned, self._alone, self._ended = False, 0, False
 
     def check(self, step: int, ends: bool) -> None:
         """Warn, once, of a number out of its order; `ends` says that it is `D2Hooks.step`'s."""
@@ -208,7 +210,12 @@ class StepOrder:
                 "which rises from one to the next, or schedules run at other steps",
                 "step" if ends else "loss", step, self.begun,
             )  # fmt: skip
-        self.begun = step
+        self._alone = self._alone + (step != self.begun) if ends == self._ended else 0
+        if self._alone == 100:
+            _log.warning(
+                "d2.%s was not called in 100 steps: call d2.loss and d2.step in each", "loss" if ends else "step"
+            )
+        self.begun, self._ended = step, ends
         self.done = step if ends else self.done
 
 

@@ -165,7 +165,7 @@ class CameraCheck:
             raise D2Error(
                 f"the prior of camera {view.camera}, frame {view.frame} was built for a camera at {_text(centres[1])} "
                 f"as seen from {first.camera} but the view is at {_text(centres[0])}, turned by {angle:.2f} degrees: "
-                "the key names another camera, or the trainer's world is scaled; build the prior with its cameras"
+                "the key names another camera, T_camera_world is inverted or in other axes, or the world is scaled"
             )
 
 

@@ -192,6 +192,10 @@ def _paint(example: Example, count: int) -> None:
 def _painted(example: Example, what: str, index: Tensor) -> Iterator[str]:
     count = len(example.backbone)
     expected = index + 1.0  # a new row, -1, holds zero
+    means, trained = example.backbone.slice_at(example.views[0]).means, [p for _, p in example.parameters]
+    held = [p for p in trained if p.requires_grad and means.requires_grad]
+    if not held or set(torch.autograd.grad(means.sum(), held, allow_unused=True)) == {None}:
+        yield f"{what}: a slice has no gradient to what the optimizer holds: put new parameters into its groups"
     for number, (optimizer, parameter) in enumerate(example.parameters):
         if not parameter.requires_grad or parameter.ndim == 0:
             continue

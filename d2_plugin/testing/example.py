@@ -50,7 +50,7 @@ Check = Callable[[Example], Iterator[str]]
 def some_points(example: Example, view: View) -> Points:
     """A few points in front of a camera, a little off Gaussians that it sees."""
     splats = example.backbone.slice_at(view)
-    depth = splats.means @ view.T_camera_world[2, :3] + view.T_camera_world[2, 3]
+    depth = splats.means @ (pose := view.T_camera_world.to(splats.means))[2, :3] + pose[2, 3]
     near = splats.means[depth > example.backbone.settings.near][:8]
     width = 0.02 * depth.abs().median().clamp(min=1e-3)
     ones = near.new_ones(len(near))

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import torch
 
+from d2_plugin.hooks.expected import check_view
 from d2_plugin.protocol import Splats, View
 from d2_plugin.rasterizer import rasterize
 from d2_plugin.testing.example import Check, Example, matrices, some_points, some_rows
@@ -18,6 +19,7 @@ def _views(example: Example) -> Iterator[str]:
             yield f"view() must return a d2_plugin.protocol.View, got {type(view).__name__}"
             return
         yield from _camera(view)
+        check_view(view)
         if (view.camera, view.frame) != (same.camera, same.frame):
             yield f"view() names one camera '{view.camera}', frame {view.frame} and then '{same.camera}', {same.frame}"
     keys = {(view.camera, view.frame) for view in views}
@@ -45,7 +47,6 @@ def _camera(view: View) -> Iterator[str]:
 
 def _slices(example: Example) -> Iterator[str]:
     count, backbone = len(example.backbone), example.backbone
-    seen = False
     for view in example.views:
         splats = backbone.slice_at(view)
         yield from _shapes(splats, count)
@@ -55,9 +56,8 @@ def _slices(example: Example) -> Iterator[str]:
         with torch.no_grad():
             if any(part.grad_fn is not None for part in backbone.slice_at(view)):  # a parameter itself is no graph
                 yield "slice_at builds a graph under torch.no_grad(): surveys would keep it in memory"
-            seen |= bool(rasterize(splats, torch.zeros_like(splats.means), view, backbone.settings).alpha.any())
-    if not seen:
-        yield "no camera sees any Gaussian: is T_camera_world world to camera, are means in the world?"
+            if not rasterize(splats, torch.zeros_like(splats.means), view, backbone.settings).alpha.any():
+                yield f"camera '{view.camera}' sees no Gaussian: is T_camera_world world to camera, are means in world?"
 
 
 def _shapes(splats: Splats, count: int) -> Iterator[str]:

@@ -192,6 +192,9 @@ def test_images_may_differ_in_size(rig: Rig) -> None:
     assert [depth.shape for depth, _ in result] == [(90, 160), (45, 80), (90, 160)]
     found, truth = result[1][0], rig.truths[1][::2, ::2]
     assert np.mean(np.abs(found - truth) < 0.05 * truth) > 0.4
+    tiny, cameras[1] = small.reshape(9, 5, 16, 5).mean(axis=(1, 3)).astype(np.uint8), scaled_camera(cameras[1], 16, 9)
+    found = patchmatch([grays(rig)[0], tiny, grays(rig)[2]], cameras, rig.depth_range)[0][0]  # as good beside it
+    assert np.mean((np.abs(found - rig.truths[0]) < 0.01 * rig.truths[0])[rig.covisible[0]]) > 0.45
 
 
 @pytest.mark.skipif(platform.machine() != "x86_64", reason="the oldest x86-64 is meant")

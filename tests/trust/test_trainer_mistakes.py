@@ -23,7 +23,7 @@ from d2_plugin.adapters.yang4d import Yang4DAdapter
 from d2_plugin.config import D2Config, DensifyConfig, DepthLossConfig, PruneConfig
 from d2_plugin.errors import D2Error
 from d2_plugin.plugin import D2Hooks
-from d2_plugin.protocol import DepthPrior, Splats
+from d2_plugin.protocol import DepthPrior, Edit, Splats
 
 VIEWS = make_views()
 
@@ -79,6 +79,13 @@ def test_some_pixels_of_a_prior_that_cannot_be_are_counted_once_per_camera(depth
 FIRST = VIEWS[0]
 
 
+def test_rounding_in_a_pose_and_a_frame_that_is_a_tensor_are_no_mistake() -> None:
+    d2, rounded = hooks(), FIRST.T_camera_world + torch.tensor([[0.0], [0], [0], [1.5e-8]])
+    for step in (1, 2):
+        d2.loss(step, replace(FIRST, frame=torch.tensor(FIRST.frame), T_camera_world=rounded))
+    assert len(d2.state_dict()["views"]["views"]) == 1
+
+
 @pytest.mark.parametrize(
     ("changes", "says"),
     [
@@ -127,6 +134,9 @@ def test_a_step_that_falls_repeats_or_differs_is_named_once(caplog: pytest.LogCa
         caplog.clear()
         after(*wrong, *wrong)
         assert caplog.text.count("which rises from one to the next") == 1
+    for one, other in (("loss", "step"), ("step", "loss")):
+        after(*((one, step) for step in range(1, 300)))
+        assert caplog.text.count(f"d2.{other} was not called in 100 steps") == 1
 
 
 @pytest.mark.parametrize(
@@ -151,6 +161,13 @@ def inserting(said: object) -> D2Hooks:
     d2 = hooks(config=D2Config(densify=DensifyConfig(start=1, every=1)), adapter=adapter)
     d2.loss(1, VIEWS[0])
     return d2
+
+
+def test_a_remove_that_keeps_what_it_should_delete_is_refused() -> None:
+    adapter = make_adapter(make_model())
+    remove, edit = adapter.remove, Edit(remove=torch.arange(len(adapter)) % 3 == 0)
+    adapter.remove = lambda mask: remove(~mask)
+    refuses("mask of 20 Gaussians and took 40: True in it", hooks(adapter=adapter)._remove, 1, [("own", edit)])
 
 
 def test_an_insert_that_adds_nothing_is_named_once(caplog: pytest.LogCaptureFixture) -> None:

@@ -67,9 +67,10 @@ def patchmatch(
     for level, (divisor, rounds) in enumerate(levels(cameras, ROUNDS)):
         coarser: Sequence[LevelView | None] = views or [None] * len(cameras)
         views = [at_resolution(*view, divisor) for view in zip(grays, cameras, coarser, masks)]
-        for index in range(len(views)):
+        for index, (view, coarse) in enumerate(zip(views, coarser)):
+            same = coarse is not None and coarse.gray.shape == view.gray.shape  # too small for the level before
             # At full size random planes are hardly ever better than those handed down.
-            kernel.match(views, index, level, rounds, explore=divisor > 1 or level == 0)
+            kernel.match(views, index, level, 1 if same else rounds, not same and (divisor > 1 or level == 0))
         _exchange(kernel, views, sources, len(ROUNDS) + level)
     for view in views:
         kernel.average(view)

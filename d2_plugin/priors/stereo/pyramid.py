@@ -14,7 +14,7 @@ NO_MATCH = 2.0
 """Worst matching cost; such a pixel has no depth."""
 
 SMALLEST_SIDE = 12
-"""Levels whose shorter side would have fewer pixels than this are skipped: an 11-pixel window must fit."""
+"""No view is made so small that its shorter side has fewer pixels than this: an 11-pixel window must fit."""
 
 
 @dataclass(eq=False)
@@ -31,8 +31,8 @@ class LevelView:
 
 
 def levels(cameras: Sequence[Camera], rounds: Sequence[int]) -> list[tuple[int, int]]:
-    """(divisor of the resolution, rounds) from coarse to fine, without levels too small for a window."""
-    side = min(min(camera.width, camera.height) for camera in cameras)
+    """(divisor of the resolution, rounds) from coarse to fine, without levels too small for every view."""
+    side = max(min(camera.width, camera.height) for camera in cameras)
     steps = [(2 ** (len(rounds) - 1 - number), count) for number, count in enumerate(rounds)]
     return [(divisor, count) for divisor, count in steps if divisor == 1 or side // divisor >= SMALLEST_SIDE]
 
@@ -40,7 +40,9 @@ def levels(cameras: Sequence[Camera], rounds: Sequence[int]) -> list[tuple[int, 
 def at_resolution(
     gray: np.ndarray, camera: Camera, coarser: LevelView | None, wanted: np.ndarray | None, divisor: int
 ) -> LevelView:
-    """The view with `divisor` times fewer pixels each way, and the planes of the coarser one if there is one."""
+    """The view `divisor` times smaller each way, or as small as may be, with the planes of the coarser one if any."""
+    while divisor > 1 and min(camera.width, camera.height) // divisor < SMALLEST_SIDE:
+        divisor //= 2
     if divisor > 1:
         camera = scaled_camera(camera, round(camera.width / divisor), round(camera.height / divisor))
         gray = shrunk(gray, (camera.height, camera.width))
