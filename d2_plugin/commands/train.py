@@ -68,7 +68,7 @@ def run(given: Given) -> str:
     show_notes([f"{name} retired at step {step}: it changed next to nothing" for name, step in run.retired.items()])
     metrics = run.evaluate()
     if metrics["background"]:
-        show("background: the prior found sky, so directions have a colour of their own at infinity")
+        show("background: directions have a colour of their own, behind all Gaussians")
     if live is not None:
         live.stay()
     table = metrics_table({options.output.name: metrics})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -199,7 +200,8 @@ class Run:
         if filled and "parallax" not in self.settings.overrides:
             # It gains nothing where another depth fills what stereo leaves empty (docs/evidence.md).
             config = replace(config, parallax=None)
-        write_text(self.folder / "d2.toml", config.to_toml())
+        beside = os.path.relpath(self.priors.resolve(), self.folder.resolve())  # as `from_toml` reads it
+        write_text(self.folder / "d2.toml", replace(config, prior=beside).to_toml())
         guidance, priors = self.guidance, self.priors
         others = {} if guidance is None else guidance.hooks(self.scene, self._points(), priors)
         return D2Hooks(config, adapter(model), hooks=others)

@@ -87,3 +87,12 @@ class TestEveryPage:
         assert len(lines) == 3
         for word in (r"D2Hooks\.attach\(", r"loss = loss \+ \S*d2\.loss\(", r"d2\.step\("):
             assert sum(bool(re.search(word, line)) for line in lines) == 1
+
+
+@pytest.mark.parametrize("page", sorted(path.stem for path in PAGES.glob("*.md")))
+def test_the_python_of_a_page_says_where_its_names_come_from(page: str) -> None:
+    for block in re.findall(r"```python\n(.*?)```", (PAGES / f"{page}.md").read_text(), re.DOTALL):
+        imports = re.findall(r"^from .*", block, re.MULTILINE)
+        exec("\n".join(imports), known := {})
+        used = set(re.findall(r"\b(?:PriorKey|KeysByPose|Path)\b", block))
+        assert used <= set(known), "the page does not import it"
