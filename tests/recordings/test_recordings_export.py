@@ -40,9 +40,10 @@ def names_of(folder: Path) -> dict[str, str]:
 
 
 @pytest.mark.parametrize("layout", ["transforms", "n3dv", "colmap"])
-def test_cameras_named_by_digits_in_any_order_read_back_the_same(layout: str, tmp_path: Path) -> None:
+def test_cameras_named_by_digits_in_any_order_read_back_the_same(layout: str, tmp_path: Path, caplog) -> None:
     whole = smooth_recording(("00", "01", "02", "03"), frames=6, width=32, height=24)
     chosen = select_cameras(select_frames(whole, (0, 5)), ("01", "00", "02"))
+    chosen = replace(chosen, late={"02": {0: -0.01, 5: 0.008}})
     folder = export_recording(chosen, layout, tmp_path / layout, test_cameras=("01",), cloud=CLOUD)
     back, names = open_recording(folder), names_of(folder)
     for name, camera in chosen.cameras.items():
@@ -51,6 +52,11 @@ def test_cameras_named_by_digits_in_any_order_read_back_the_same(layout: str, tm
         np.testing.assert_allclose(found.K, camera.K, atol=1e-6)
         np.testing.assert_allclose(found.T_camera_world, camera.T_camera_world, atol=1e-6)
     np.testing.assert_array_equal(back.image(names["02"], 5), chosen.image("02", 5))
+    if layout == "transforms":
+        assert (back.late, back.frames, back.fps) == (chosen.late, chosen.frames, pytest.approx(chosen.fps))
+        listed = json.loads((folder / "transforms_train.json").read_text())["frames"]
+        assert [one["time"] for one in listed[2:]] == pytest.approx([0, 5 / chosen.fps + 0.018])
+    assert ("cannot say" in caplog.text) == (layout != "transforms")
     if layout == "n3dv":
         assert names == {"01": "cam00", "00": "cam01", "02": "cam02"}, "its readers hold out the first"
         assert {path.name for path in (folder / "frames").iterdir()} == set(names.values())

@@ -12,6 +12,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -26,6 +27,8 @@ from d2_plugin.recordings.export.ply import PointCloud
 from d2_plugin.recordings.export.transforms_json import write_transforms
 from d2_plugin.recordings.recording import Recording
 from d2_plugin.values import checked_arguments
+
+log = logging.getLogger(__name__)
 
 WRITERS: dict[str, Callable[[Export], Written]] = {
     "transforms": write_transforms,
@@ -64,6 +67,8 @@ def export_recording(
         cloud.check()
     for camera in recording.cameras.values():
         refuse_skew(camera.name, camera.K)
+    if recording.late and layout != "transforms":
+        log.warning("cameras did not expose together, which layout %s cannot say: choose the layout transforms", layout)
     with whole_folder(path) as folder:
         written = WRITERS[layout](Export(recording, held_out, cloud, folder))
         description = {
