@@ -14,7 +14,9 @@ from recorded import Filmed, Shooting, video, write_video
 from stand_in_recordings import renamed
 
 from d2_plugin.commands.cli import main
+from d2_plugin.durable import read_table, write_table
 from d2_plugin.recordings import Recording, open_recording
+from d2_plugin.recordings.readers.videos import KIND
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 
 pytest.importorskip("av")
@@ -213,6 +215,10 @@ def test_a_video_that_moved_since_it_was_imported(given: Filmed, tmp_path: Path,
     (given.videos / "03.mp4").rename(tmp_path / "elsewhere.mp4")
     assert "the video of camera 03 is not at" in refused("plan", folder, "--train-cameras", "all")
     assert open_recording(folder, cameras=["02"]).image("02", 0).shape == (136, 240, 3)
+    table = read_table(folder / "videos.json", KIND)
+    table["cameras"]["02"]["video"]["stamps"] = ["soon"]
+    write_table(folder / "videos.json", table, KIND)
+    assert "videos.json (invalid literal" in refused("plan", folder, "--train-cameras", "all")
 
 
 def test_a_calibration_folder_is_not_searched_without_end(given: Filmed, tmp_path, refused, monkeypatch) -> None:
