@@ -90,10 +90,12 @@ def case_name(recording: str, settings: RunSettings) -> str:
 
 
 def told_apart(rows: Sequence[Row]) -> list[Row]:
-    """The rows, with the cameras behind the case where some of one case trained with other ones, and those that scored
-    and the frames where rows of runs say them: their means are not to be mixed. Others stay as they are."""
+    """The rows, with the cameras behind the case where some of one case trained with other ones, and those that scored,
+    the frames and a hash of an image (recordings of one name) where rows of runs say them: their means are not to be
+    mixed. Others stay as they are."""
     told = list(rows)
-    for name, front in (("cameras", ""), ("test_cameras", "scored "), ("frames", "frames ")):
+    of_runs = ("test_cameras", "scored "), ("frames", "frames "), ("images", "images ")
+    for name, front in (("cameras", ""), *of_runs):
         said = [_listed(row[name]) if name in row and (not front or "test_cameras" in row) else "" for row in told]
         known = {(row["kind"], row["case"], text) for row, text in zip(told, said) if text}
         several = Counter(case[:2] for case in known)
@@ -104,8 +106,9 @@ def told_apart(rows: Sequence[Row]) -> list[Row]:
     return told
 
 
-def _listed(names: Sequence[Any] | None) -> str:
-    names = ["all"] if names is None else names
+def _listed(names: str | Sequence[Any] | None) -> str:
+    if names is None or isinstance(names, str):
+        return "all" if names is None else names
     return " ".join(map(str, names)) if len(names) < 9 else f"{names[0]} to {names[-1]}, {len(names)} of them"
 
 

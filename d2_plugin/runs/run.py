@@ -15,6 +15,7 @@ from d2_plugin.durable import remove_leftovers, write_table, write_text
 from d2_plugin.errors import D2Error
 from d2_plugin.locks import only_writer
 from d2_plugin.plugin import D2Hooks
+from d2_plugin.priors.frame import view_digest
 from d2_plugin.priors.summary import PriorSummary
 from d2_plugin.progress import progress_bar
 from d2_plugin.runs import saved
@@ -273,6 +274,7 @@ def _about(run: Run, trainer: Any) -> dict[str, Any]:
         "trials": run.trials,
         "plan": scene.plan.as_dict(),
         "recording": scene.recording.name,
+        "images": view_digest(scene.recording, scene.train_cameras[0], scene.recording.frames[-1])[:8],
         "mono_emulated": scene.plan.emulated,
         "notes": list(scene.recording.notes),
         "made": circumstances(),

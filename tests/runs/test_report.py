@@ -188,6 +188,9 @@ def test_other_cameras_or_frames_of_one_recording_are_another_case() -> None:
     frames = [row(["00"]) | {"test_cameras": ["01"], "frames": frames} for frames in (None, [0, 2], list(range(20)))]
     ends = ["all", "0 2", "0 to 19, 20 of them"]
     assert [each["case"] for each in told_apart(frames)] == [f"plaza, 2 views, frames {end}" for end in ends]
+    of_one_name = [frames[0] | {"images": images} for images in ("3f0c", "a771", "")]
+    names = ["plaza, 2 views, images 3f0c", "plaza, 2 views, images a771", "plaza, 2 views"]
+    assert [each["case"] for each in told_apart(of_one_name)] == names
 
 
 def test_a_run_folder_becomes_a_row_with_the_priors_time_beside(tmp_path: Path) -> None:
