@@ -58,14 +58,11 @@ class Kind(NamedTuple):
 
 def cannot_write(path: Path, error: OSError) -> CannotWrite:
     """The sentence for a write that failed."""
-    advice = "check the disk"
-    if error.errno in FULL:
-        advice = "make room"
-    elif error.errno in FORBIDDEN:
-        advice = "choose a folder that you may write"
     reason = error.strerror or str(error)
     if error.errno in NO_PLACE:
         return CannotWrite(f"cannot write {path} ({reason}): choose another place")
+    allowed = "choose a folder that you may write" if error.errno in FORBIDDEN else "check the disk"
+    advice = "make room" if error.errno in FULL else allowed
     return CannotWrite(f"cannot write {path} ({reason}): {advice} and give the same command again, which goes on")
 
 

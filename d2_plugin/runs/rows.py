@@ -94,8 +94,7 @@ def told_apart(rows: Sequence[Row]) -> list[Row]:
     the frames and a hash of an image (recordings of one name) where rows of runs say them: their means are not to be
     mixed. Others stay as they are."""
     told = list(rows)
-    of_runs = ("test_cameras", "scored "), ("frames", "frames "), ("images", "images ")
-    for name, front in (("cameras", ""), *of_runs):
+    for name, front in (("cameras", ""), ("test_cameras", "scored "), ("frames", "frames "), ("images", "images ")):
         said = [_listed(row[name]) if name in row and (not front or "test_cameras" in row) else "" for row in told]
         known = {(row["kind"], row["case"], text) for row, text in zip(told, said) if text}
         several = Counter(case[:2] for case in known)
@@ -106,9 +105,8 @@ def told_apart(rows: Sequence[Row]) -> list[Row]:
     return told
 
 
-def _listed(names: str | Sequence[Any] | None) -> str:
-    if names is None or isinstance(names, str):
-        return "all" if names is None else names
+def _listed(names: Sequence[Any] | None) -> str:
+    names = ["all"] if names is None else names
     return " ".join(map(str, names)) if len(names) < 9 else f"{names[0]} to {names[-1]}, {len(names)} of them"
 
 

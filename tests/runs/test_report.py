@@ -115,6 +115,13 @@ class TestGroups:
         lines = [line.strip("| ").split(" | ") for line in text.splitlines() if "no verdict" in line]
         assert [line[1] for line in lines] == ["stereo alone", "backbone alone", "D² (deform), x", "D² (deform)"]
 
+    def test_what_a_prior_of_unknown_time_took_is_not_drawn_as_nothing(self, tmp_path: Path) -> None:
+        cut_off = scored("yang4d full", 0, psnr=20.0) | {"prior_seconds": None}
+        page, text = make_report([cut_off, scored("yang4d backbone", 0, psnr=19.0)], tmp_path)[:2]
+        assert "no known time of its prior is not drawn" in text.read_text()
+        assert "alone, 10 s: 19.00 dB in 0.02 minutes" in page.read_text()
+        assert "20.00 dB in" not in page.read_text()
+
     def test_a_repeated_seed_is_no_further_one(self) -> None:
         row = scored("yang4d full", 0, psnr=28.0)
         assert scores_table(groups_of([row, row])).rows[0][3:5] == ("one seed", "28.00")
@@ -188,7 +195,7 @@ def test_other_cameras_or_frames_of_one_recording_are_another_case() -> None:
     frames = [row(["00"]) | {"test_cameras": ["01"], "frames": frames} for frames in (None, [0, 2], list(range(20)))]
     ends = ["all", "0 2", "0 to 19, 20 of them"]
     assert [each["case"] for each in told_apart(frames)] == [f"plaza, 2 views, frames {end}" for end in ends]
-    of_one_name = [frames[0] | {"images": images} for images in ("3f0c", "a771", "")]
+    of_one_name = [frames[0] | {"images": images} for images in (["3f0c"], ["a771"], [])]
     names = ["plaza, 2 views, images 3f0c", "plaza, 2 views, images a771", "plaza, 2 views"]
     assert [each["case"] for each in told_apart(of_one_name)] == names
 

@@ -28,8 +28,6 @@ from d2_plugin.recordings.export.transforms_json import write_transforms
 from d2_plugin.recordings.recording import Recording
 from d2_plugin.values import checked_arguments
 
-log = logging.getLogger(__name__)
-
 WRITERS: dict[str, Callable[[Export], Written]] = {
     "transforms": write_transforms,
     "n3dv": write_n3dv,
@@ -68,7 +66,8 @@ def export_recording(
     for camera in recording.cameras.values():
         refuse_skew(camera.name, camera.K)
     if recording.late and layout != "transforms":
-        log.warning("cameras did not expose together, which layout %s cannot say: choose the layout transforms", layout)
+        say = logging.getLogger(__name__).warning
+        say("cameras did not expose together, which layout %s cannot say: choose the layout transforms", layout)
     with whole_folder(path) as folder:
         written = WRITERS[layout](Export(recording, held_out, cloud, folder))
         description = {
