@@ -156,7 +156,7 @@ def test_the_command_writes_points_and_says_where(tmp_path: Path, answered) -> N
     more = ["--test-cameras", "01", "--frames", "0:1", "--downscale", "4", "--points", "50"]
     assert f"in {tmp_path / 'scene'} (transforms)" in answered("export-recording", *command.split(), *more)
     one = f"{source} --format gsplat --output {tmp_path / 'one'} --points 0 --test-cameras 00"
-    assert answered("export-recording", *one.split()).startswith("4 cameras, 1 frames, no initial points in")
+    assert answered("export-recording", *one.split()).startswith("4 cameras, 1 frame, no initial points in")
     content = json.loads((tmp_path / "scene" / "export.json").read_text())
     assert (list(content["cameras"]), content["test_cameras"]) == (["00", "02", "01"], ["01"])
     header = (tmp_path / "scene" / "points3d.ply").read_bytes().split(b"end_header")[0].decode()
