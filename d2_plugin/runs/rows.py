@@ -91,8 +91,7 @@ def case_name(recording: str, settings: RunSettings) -> str:
 
 def told_apart(rows: Sequence[Row]) -> list[Row]:
     """The rows, with the cameras behind the case where some of one case trained with other ones, and those that scored,
-    the frames and a hash of an image (recordings of one name) where rows of runs say them: their means are not to be
-    mixed. Others stay as they are."""
+    the frames and a hash of an image where rows of runs say them: their means are not to be mixed."""
     told = list(rows)
     for name, front in (("cameras", ""), ("test_cameras", "scored "), ("frames", "frames "), ("images", "images ")):
         said = [_listed(row[name]) if name in row and (not front or "test_cameras" in row) else "" for row in told]

@@ -3,8 +3,6 @@
 import io
 import math
 import shutil
-import signal
-import time
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -196,23 +194,16 @@ def test_a_run_goes_on_from_the_checkpoint_before_one_that_cannot_be_written(sce
 
     with monkeypatch.context() as patch:
         patch.setattr(run_module.saved, "save_checkpoint", full)
+        saved[:] = [0, 0, 0]
+        refuses("cannot write", run.train)
+        assert bare(scene, run.folder, iterations=6).seconds["priors"] == run.seconds["priors"] > 0, "kept meanwhile"
+        saved.clear()
         refuses("cannot write", run.train)
     assert load_checkpoint(run.folder / "checkpoint.pt", "cpu")["step"] == 3
     saved.clear()
     monkeypatch.setattr(run_module.saved, "save_checkpoint", lambda path, state: saved.append(state["step"]))
     bare(scene, tmp_path / "run", iterations=6).train()
     assert saved == [4, 5, 6], "it goes on from there"
-
-
-def test_time_of_the_prior_counts_where_a_run_stopped_before_its_first_checkpoint(scene, tmp_path, monkeypatch) -> None:
-    for name in ("_points", "_trainer"):  # in the middle of the prior, and behind it
-        with monkeypatch.context() as patch:
-            patch.setattr(Run, "uses_prior", property(lambda self: time.sleep(0.1)))
-            patch.setattr(Run, name, lambda *_: time.sleep(0.1) or signal.raise_signal(signal.SIGINT))
-            with pytest.raises(KeyboardInterrupt):
-                bare(scene, tmp_path / "run").train()
-    (run := bare(scene, tmp_path / "run")).train()
-    assert run.seconds["priors"] > 0.2
 
 
 def test_a_background_begins_with_the_colours_of_the_images(scene: Path, tmp_path: Path) -> None:

@@ -66,8 +66,7 @@ def export_recording(
     for camera in recording.cameras.values():
         refuse_skew(camera.name, camera.K)
     if recording.late and layout != "transforms":
-        say = logging.getLogger(__name__).warning
-        say("cameras did not expose together, which layout %s cannot say: choose the layout transforms", layout)
+        logging.getLogger(__name__).warning("cameras expose apart, which %s cannot say: choose transforms", layout)
     with whole_folder(path) as folder:
         written = WRITERS[layout](Export(recording, held_out, cloud, folder))
         description = {

@@ -20,8 +20,7 @@ def write_transforms(export: Export) -> Written:
     `time` is when the camera took the image, in seconds since the first; where cameras did not expose together, `late`
     says how far that is from the instant of its frame. `transform_matrix` maps an OpenGL camera to the world.
     """
-    first = export.recording.frames[0]
-    begin = min(0.0, *(export.recording.seconds(first, name) for name in export.recording.cameras))
+    begin = min(0.0, *(export.recording.seconds(export.recording.frames[0], name) for name in export.recording.cameras))
     export.write_images(lambda camera, frame: export.folder / f"{_stem(camera, frame)}.png")
     for split, cameras in (("train", export.train_cameras), ("test", export.test_cameras)):
         content = _transforms(export, cameras or export.train_cameras[:1], begin)

@@ -32,9 +32,8 @@ class Group(NamedTuple):
     @property
     def minutes(self) -> float:
         """Of prior and training; NaN where nobody knows them, since making the prior was cut off."""
-        times = [(row["seconds"], row.get("prior_seconds", 0.0)) for row in self.rows]
-        known = [sum(parts) for parts in times if None not in parts]
-        return mean(known) / 60 if known else math.nan
+        known = [row for row in self.rows if row.get("prior_seconds", 0.0) is not None]
+        return mean(row["seconds"] + row.get("prior_seconds", 0.0) for row in known) / 60 if known else math.nan
 
     def scores(self, column: Column) -> list[float]:
         """The scores of the runs that have one in this metric."""
