@@ -50,7 +50,8 @@ def run(settings: RecordingExport) -> str:
     folder = export_recording(recording, settings.format, settings.output, test_cameras=held_out, cloud=cloud)
     written = read_json(folder / EXPORT_FILE, "export again")
     points = "no" if cloud is None else len(cloud.positions)
-    what = f"{len(written['cameras'])} cameras, {len(written['frames'])} frames, {points} initial points"
+    frames = f"{len(written['frames'])} frame{'s' * (len(written['frames']) != 1)}"
+    what = f"{len(written['cameras'])} cameras, {frames}, {points} initial points"
     return f"{what} in {settings.output} ({settings.format})"
 
 

@@ -16,6 +16,6 @@ def run(settings: ImportSettings) -> str:
     show_notes(recording.notes)
     sizes = sorted({(camera.width, camera.height) for camera in recording.cameras.values()})
     shown = ", ".join(f"{width}x{height}" for width, height in sizes)
-    about = f"{len(recording.cameras)} cameras, {len(recording.frames)} frames at {recording.rate:g} per second"
+    frames = f"{len(recording.frames)} frame{'s' * (len(recording.frames) != 1)} at {recording.rate:g} per second"
     plan = f"`d2 plan {settings.output} --train-cameras all` says what is used and what is left out"
-    return f"{about}, {shown} pixels in {settings.output}\n{plan}"
+    return f"{len(recording.cameras)} cameras, {frames}, {shown} pixels in {settings.output}\n{plan}"

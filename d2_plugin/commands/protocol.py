@@ -77,7 +77,7 @@ def run(settings: ProtocolRun) -> str:
     without = [column.title for column in columns if not any(group.scores(column) for group in groups)]
     lines = [
         f"{settings.name}: trains on {', '.join(train)}, scores {', '.join(test or ())}; "
-        f"{'x'.join(map(str, about['size']))} pixels, {len(frames)} frames, {iterations} steps",
+        f"{'x'.join(map(str, about['size']))} pixels, {len(frames)} frame{'s' * (len(frames) > 1)}, {iterations} steps",
         markdown(scores_table(groups, columns)),
         *(f"not as published: {line}" for line in about["differs"]),
         *([f"published and not measured here: {', '.join(without)}"] if without else []),

@@ -86,8 +86,8 @@ def common_frames(files: Mapping[str, Iterable[int]], where: Path) -> tuple[tupl
         raise D2Error(f"no frames in {where}: expected images named like 00000.png or 00000.jpg")
     if not shared:
         raise D2Error(f"no frame in {where} is there for all of {', '.join(files)}: give every camera the same frames")
-    notes = (f"{len(every - shared)} frames left out because not every camera has them",) if every - shared else ()
-    return tuple(sorted(shared)), notes
+    out = len(every - shared)
+    return tuple(sorted(shared)), (f"{out} frame{'s' * (out > 1)} left out: not every camera has them",) if out else ()
 
 
 def cameras_with_images(

@@ -90,10 +90,10 @@ def case_name(recording: str, settings: RunSettings) -> str:
 
 
 def told_apart(rows: Sequence[Row]) -> list[Row]:
-    """The rows, with the cameras behind the case where some of one case trained with other ones, and those that scored
-    and the frames where rows of runs say them: their means are not to be mixed. Others stay as they are."""
+    """The rows, with the cameras behind the case where some of one case trained with other ones, and those that scored,
+    the frames and a hash of an image where rows of runs say them: their means are not to be mixed."""
     told = list(rows)
-    for name, front in (("cameras", ""), ("test_cameras", "scored "), ("frames", "frames ")):
+    for name, front in (("cameras", ""), ("test_cameras", "scored "), ("frames", "frames "), ("images", "images ")):
         said = [_listed(row[name]) if name in row and (not front or "test_cameras" in row) else "" for row in told]
         known = {(row["kind"], row["case"], text) for row, text in zip(told, said) if text}
         several = Counter(case[:2] for case in known)

@@ -12,10 +12,11 @@ from pathlib import Path
 from typing import Any
 
 from d2_plugin import registry
-from d2_plugin.durable import remove_leftovers, write_table, write_text
+from d2_plugin.durable import read_table, remove_leftovers, write_table, write_text
 from d2_plugin.errors import D2Error
 from d2_plugin.locks import only_writer
 from d2_plugin.plugin import D2Hooks
+from d2_plugin.priors.frame import view_digest
 from d2_plugin.priors.summary import PriorSummary
 from d2_plugin.progress import progress_bar
 from d2_plugin.runs import saved
@@ -24,6 +25,7 @@ from d2_plugin.runs.prior.trials import LEAST_ITERATIONS, can_decide, tried
 from d2_plugin.runs.rows import circumstances
 from d2_plugin.runs.scene import Guidance, Scene
 from d2_plugin.runs.settings import HOOK_NAMES, RunSettings, check, hook_config, hooks_in_use
+from d2_plugin.runs.shared import COST
 from d2_plugin.runs.start import TimedPoints, triangulated_points
 from d2_plugin.store.store import PriorStore
 from d2_plugin.values import checked_arguments
@@ -61,6 +63,9 @@ class Run:
         self.seconds = {"priors": 0.0, "train": 0.0, "eval": 0.0}
         self.cpu_seconds = dict(self.seconds)
         """The same in CPU time."""
+        self._spent = folder / "prior.seconds.json"
+        if self._spent.is_file() and not self._checkpoint.exists():
+            self.seconds["priors"], self.cpu_seconds["priors"] = read_table(self._spent, COST)["seconds"]
         self.retired: dict[str, int] = {}
         """Hooks that stopped because they changed next to nothing, and at which step."""
         self.prior: dict[str, Any] | None = None
@@ -202,13 +207,11 @@ class Run:
             config = replace(config, parallax=None)
         beside = os.path.relpath(self.priors.resolve(), self.folder.resolve())  # as `from_toml` reads it
         write_text(self.folder / "d2.toml", replace(config, prior=beside).to_toml())
-        guidance, priors = self.guidance, self.priors
-        others = {} if guidance is None else guidance.hooks(self.scene, self._points(), priors)
+        others = {} if self.guidance is None else self.guidance.hooks(self.scene, self._points(), self.priors)
         return D2Hooks(config, adapter(model), hooks=others)
 
     def _save(self, trainer: Any) -> None:
-        used: dict[str, Any] = {"seconds": dict(self.seconds), "cpu_seconds": dict(self.cpu_seconds)}
-        used |= {"prior": self.prior, "trials": self.trials}
+        used = {name: getattr(self, name) for name in ("seconds", "cpu_seconds", "prior", "trials")}
         saved.save_checkpoint(self._checkpoint, trainer.state_dict() | used)
 
     def _restore(self, trainer: Any) -> bool:
@@ -220,9 +223,8 @@ class Run:
             if trainer.d2 is None:
                 state["d2"] = None
             trainer.load_state_dict(state)
-            self.seconds = {name: max(value, self.seconds[name]) for name, value in state["seconds"].items()}
-            kept = state["cpu_seconds"]
-            self.cpu_seconds = {name: max(value, kept[name]) for name, value in self.cpu_seconds.items()}
+            for own, kept in ((self.seconds, state["seconds"]), (self.cpu_seconds, state["cpu_seconds"])):
+                own.update({name: max(value, kept[name]) for name, value in own.items()})
             self.prior, self.trials = self.prior or state["prior"], self.trials or state["trials"]
         wrong = saved.what_diverged(trainer.model)
         if wrong:
@@ -252,6 +254,8 @@ class Run:
         finally:
             self.seconds[name] += time.monotonic() - start
             self.cpu_seconds[name] += time.process_time() - cpu
+            if not self._checkpoint.exists():  # which says it later: until then a run that is cut off would forget it
+                write_table(self._spent, {"seconds": [self.seconds["priors"], self.cpu_seconds["priors"]]}, COST)
 
 
 def _about(run: Run, trainer: Any) -> dict[str, Any]:
@@ -275,6 +279,7 @@ def _about(run: Run, trainer: Any) -> dict[str, Any]:
         "trials": run.trials,
         "plan": scene.plan.as_dict(),
         "recording": scene.recording.name,
+        "images": [view_digest(scene.recording, scene.train_cameras[0], scene.recording.frames[-1])[:8]],
         "mono_emulated": scene.plan.emulated,
         "notes": list(scene.recording.notes),
         "made": circumstances(),

@@ -53,6 +53,8 @@ class Shared:
 
 def share_points(settings: RunSettings, folder: Path) -> Path:
     """Triangulate where `folder` has no points.npz yet; returns its path. Those of other images are refused."""
+    if (folder / "run.json").exists():
+        raise D2Error(f"{folder} holds a run of `d2 train`: give another --output")
     points, of = folder / "points.npz", {name: check(settings).as_table()[name] for name in OF}
     camera = settings.train_cameras[0]
     seen = open_recording(settings.recording, cameras=[camera], frames=settings.frames, downscale=settings.downscale)

@@ -133,6 +133,7 @@ class TestMistakes:
             (Work, ["--steps", "ten"], "setting --steps must be a whole number, got 'ten'"),
             (Work, ["--frames", "0-8"], "--frames is '0-8': give whole numbers joined by commas, or first:last"),
             (Work, ["--frames", "0:8:0"], "--frames is '0:8:0'"),
+            (Work, ["--frames", ""], "--frames is '': give whole numbers"),
             (Work, ["--prune.edges.width", "0"], "--prune.edges.width must be at least 1 pixels, got 0"),
             (Work, ["--prune.enabled", "perhaps"], "--prune.enabled must be"),
             (Work, ["--prune.enabled"], "--prune.enabled needs a value"),

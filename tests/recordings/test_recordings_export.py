@@ -40,9 +40,10 @@ def names_of(folder: Path) -> dict[str, str]:
 
 
 @pytest.mark.parametrize("layout", ["transforms", "n3dv", "colmap"])
-def test_cameras_named_by_digits_in_any_order_read_back_the_same(layout: str, tmp_path: Path) -> None:
+def test_cameras_named_by_digits_in_any_order_read_back_the_same(layout: str, tmp_path: Path, caplog) -> None:
     whole = smooth_recording(("00", "01", "02", "03"), frames=6, width=32, height=24)
     chosen = select_cameras(select_frames(whole, (0, 5)), ("01", "00", "02"))
+    chosen = replace(chosen, late={"02": {0: -0.01, 5: 0.008}})
     folder = export_recording(chosen, layout, tmp_path / layout, test_cameras=("01",), cloud=CLOUD)
     back, names = open_recording(folder), names_of(folder)
     for name, camera in chosen.cameras.items():
@@ -51,6 +52,11 @@ def test_cameras_named_by_digits_in_any_order_read_back_the_same(layout: str, tm
         np.testing.assert_allclose(found.K, camera.K, atol=1e-6)
         np.testing.assert_allclose(found.T_camera_world, camera.T_camera_world, atol=1e-6)
     np.testing.assert_array_equal(back.image(names["02"], 5), chosen.image("02", 5))
+    if layout == "transforms":
+        assert (back.late, back.frames, back.fps) == (chosen.late, chosen.frames, pytest.approx(chosen.fps))
+        last = json.loads((folder / "transforms_train.json").read_text())["frames"][-1]["time"]
+        assert last == pytest.approx(5 / chosen.fps + 0.018), "the first one is at 0"
+    assert ("cannot say" in caplog.text) == (layout != "transforms")
     if layout == "n3dv":
         assert names == {"01": "cam00", "00": "cam01", "02": "cam02"}, "its readers hold out the first"
         assert {path.name for path in (folder / "frames").iterdir()} == set(names.values())
@@ -150,7 +156,7 @@ def test_the_command_writes_points_and_says_where(tmp_path: Path, answered) -> N
     more = ["--test-cameras", "01", "--frames", "0:1", "--downscale", "4", "--points", "50"]
     assert f"in {tmp_path / 'scene'} (transforms)" in answered("export-recording", *command.split(), *more)
     one = f"{source} --format gsplat --output {tmp_path / 'one'} --points 0 --test-cameras 00"
-    assert answered("export-recording", *one.split()).startswith("4 cameras, 1 frames, no initial points in")
+    assert answered("export-recording", *one.split()).startswith("4 cameras, 1 frame, no initial points in")
     content = json.loads((tmp_path / "scene" / "export.json").read_text())
     assert (list(content["cameras"]), content["test_cameras"]) == (["00", "02", "01"], ["01"])
     header = (tmp_path / "scene" / "points3d.ply").read_bytes().split(b"end_header")[0].decode()

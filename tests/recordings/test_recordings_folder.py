@@ -96,7 +96,7 @@ def test_frames_that_not_every_camera_has_are_left_out_and_noted(folder: Path) -
     (folder / "images" / "train1" / "00001.png").unlink()
     recording = open_recording(folder)
     assert recording.frames == (0,)
-    assert any("1 frames left out" in note for note in recording.notes)
+    assert any("1 frame left out" in note for note in recording.notes)
     chosen = open_recording(folder, cameras=["test0", "train0"], frames=[1])
     assert (list(chosen.cameras), chosen.frames) == (["test0", "train0"], (1,))
 

@@ -20,6 +20,7 @@ class TestPresets:
         names = [preset.name for preset in rows_named(["ablation", "pruning", "full"])]
         assert len(names) == len(set(names)) == 12
         refuses("no_pruning", rows_named, ["no_prunning"])
+        refuses("unknown table or preset ''", rows_named, [])
 
     @pytest.mark.parametrize("name", PRESETS)
     def test_every_preset_is_accepted_by_the_settings_check(self, name: str) -> None:
@@ -110,4 +111,5 @@ def test_the_command_trains_shares_priors_and_repeats_nothing(saved_room, tmp_pa
     assert "another run" in refused(*command, "--iterations", "9")
     for path in (room / "images" / "train0").iterdir():
         write_grey(path, 99, (96, 54))  # another recording in a folder of the same name
+    assert "holds a run of `d2 train`: give" in refused(*command[:-1], str(next(iter(checkpoints)).parent))
     assert "of another frames, recording: give" in refused(*command, "--rows", "no_rgbd", "--frames", "0")

@@ -39,7 +39,7 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
     append_rows(rows, committed())
     told = run(ReportSettings((rows,), folder / "out"))
     assert str(folder / "out" / "report.html") in told
-    assert told.startswith(f"{len(committed())} rows")
+    assert f"rows: {len(committed())}, plots: " in told
     return folder / "out"
 
 
@@ -115,6 +115,12 @@ class TestGroups:
         lines = [line.strip("| ").split(" | ") for line in text.splitlines() if "no verdict" in line]
         assert [line[1] for line in lines] == ["stereo alone", "backbone alone", "D² (deform), x", "D² (deform)"]
 
+    def test_a_prior_of_unknown_time_is_not_drawn_as_none(self, tmp_path: Path) -> None:
+        rows = [scored("yang4d full", 0, psnr=20.0) | {"prior_seconds": None}, scored("yang4d backbone", 0, psnr=19.0)]
+        page = make_report(rows, tmp_path)[0].read_text()
+        assert "no known time of its prior is not drawn" in page
+        assert ("19.00 dB in 0.02 minutes" in page, "20.00 dB in" in page) == (True, False)
+
     def test_a_repeated_seed_is_no_further_one(self) -> None:
         row = scored("yang4d full", 0, psnr=28.0)
         assert scores_table(groups_of([row, row])).rows[0][3:5] == ("one seed", "28.00")
@@ -188,6 +194,8 @@ def test_other_cameras_or_frames_of_one_recording_are_another_case() -> None:
     frames = [row(["00"]) | {"test_cameras": ["01"], "frames": frames} for frames in (None, [0, 2], list(range(20)))]
     ends = ["all", "0 2", "0 to 19, 20 of them"]
     assert [each["case"] for each in told_apart(frames)] == [f"plaza, 2 views, frames {end}" for end in ends]
+    of_one_name = told_apart([frames[0] | {"images": images} for images in (["3f0c"], ["a771"], [])])
+    assert [each["case"][14:] for each in of_one_name] == [", images 3f0c", ", images a771", ""]
 
 
 def test_a_run_folder_becomes_a_row_with_the_priors_time_beside(tmp_path: Path) -> None:

@@ -194,6 +194,10 @@ def test_a_run_goes_on_from_the_checkpoint_before_one_that_cannot_be_written(sce
 
     with monkeypatch.context() as patch:
         patch.setattr(run_module.saved, "save_checkpoint", full)
+        saved[:] = [0, 0, 0]
+        refuses("cannot write", run.train)
+        assert bare(scene, run.folder, iterations=6).seconds["priors"] == run.seconds["priors"] > 0, "kept meanwhile"
+        saved.clear()
         refuses("cannot write", run.train)
     assert load_checkpoint(run.folder / "checkpoint.pt", "cpu")["step"] == 3
     saved.clear()

@@ -93,7 +93,7 @@ def _plain(kind: Any, text: str) -> Any:
 
 def _numbers(pieces: Sequence[str], flag: str) -> tuple[int, ...]:
     values: list[int] = []
-    for piece in pieces:
+    for piece in pieces or [""]:
         try:
             first, *last = (int(part) for part in piece.split(":"))
             numbers = range(first, last[0] + 1, *last[1:]) if last else [first]

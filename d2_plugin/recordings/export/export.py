@@ -12,6 +12,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -64,6 +65,8 @@ def export_recording(
         cloud.check()
     for camera in recording.cameras.values():
         refuse_skew(camera.name, camera.K)
+    if recording.late and layout != "transforms":
+        logging.getLogger(__name__).warning("cameras expose apart, which %s cannot say: choose transforms", layout)
     with whole_folder(path) as folder:
         written = WRITERS[layout](Export(recording, held_out, cloud, folder))
         description = {

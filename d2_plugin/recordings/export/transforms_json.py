@@ -17,16 +17,19 @@ from d2_plugin.recordings.recording import Camera
 def write_transforms(export: Export) -> Written:
     """transforms_train.json, transforms_test.json, images/CAMERA_FRAME.png and points3d.ply; names are kept.
 
-    `time` is in seconds since the first frame; `transform_matrix` maps an OpenGL camera to the world.
+    `time` is when the camera took the image, in seconds since the first; where cameras did not expose together, `late`
+    says how far that is from the instant of its frame. `transform_matrix` maps an OpenGL camera to the world.
     """
+    begin = min(0.0, *(export.recording.seconds(export.recording.frames[0], name) for name in export.recording.cameras))
     export.write_images(lambda camera, frame: export.folder / f"{_stem(camera, frame)}.png")
     for split, cameras in (("train", export.train_cameras), ("test", export.test_cameras)):
-        content = _transforms(export, cameras or export.train_cameras[:1])
+        content = _transforms(export, cameras or export.train_cameras[:1], begin)
         content["frames"] = content["frames"] if cameras else []
         path = export.folder / f"transforms_{split}.json"
         path.write_text(json_text(content, path.name, indent=1) + "\n")
     if export.cloud is not None:
-        write_point_cloud(export.folder / "points3d.ply", export.cloud)
+        times = None if export.cloud.times is None else export.cloud.times - begin
+        write_point_cloud(export.folder / "points3d.ply", export.cloud._replace(times=times))
     return export.written()
 
 
@@ -34,7 +37,7 @@ def _stem(camera: str, frame: int) -> str:
     return f"images/{camera}_{frame:04d}"
 
 
-def _transforms(export: Export, cameras: tuple[str, ...]) -> dict[str, Any]:
+def _transforms(export: Export, cameras: tuple[str, ...], begin: float) -> dict[str, Any]:
     recording = export.recording
     described = [recording.cameras[name] for name in cameras]
     alike = _by_angle_alone(list(recording.cameras.values()))
@@ -43,7 +46,8 @@ def _transforms(export: Export, cameras: tuple[str, ...]) -> dict[str, Any]:
     content["frames"] = [
         {
             "file_path": _stem(camera.name, frame),
-            "time": recording.seconds(frame),
+            "time": recording.seconds(frame, camera.name) - begin,
+            **({"late": recording.late.get(camera.name, {}).get(frame, 0.0)} if recording.late else {}),
             "transform_matrix": (np.linalg.inv(camera.T_camera_world) @ OPENGL_TO_OPENCV).tolist(),
             **({} if alike else _intrinsics(camera)),
         }

@@ -8,6 +8,7 @@ without times from many poses is one instant. Intrinsics may stand at the top or
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple, Optional
 
@@ -54,7 +55,11 @@ def open_transforms(path: Path, cameras: tuple[str, ...] | None = None, intersec
     first = {shot.camera: entries[name] for name, shot in shots.items() if shot.frame == frames[0]}
     calibrated = {name: _camera(name, first[name]) for name in images}
     notes = (*notes, *_split_notes(entries, shots), *frame_notes)
-    return assembled(path, calibrated, images, frames, fps, str(path), notes)
+    late: dict[str, dict[int, float]] = {}
+    for name, shot in shots.items():
+        if entries[name].image.late:
+            late.setdefault(shot.camera, {})[shot.frame] = entries[name].image.late
+    return replace(assembled(path, calibrated, images, frames, fps, str(path), notes), late=late)
 
 
 def _entries(path: Path) -> dict[str, _Entry]:

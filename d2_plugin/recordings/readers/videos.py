@@ -9,7 +9,7 @@ from pathlib import Path
 
 from d2_plugin.durable import Kind, read_table
 from d2_plugin.errors import D2Error
-from d2_plugin.reading import shown_path
+from d2_plugin.reading import parsing, shown_path
 from d2_plugin.recordings.importing.source import VideosSource
 from d2_plugin.recordings.importing.video import VideoFile, read_video
 from d2_plugin.recordings.readers.folder import with_measured
@@ -29,13 +29,11 @@ def open_videos(path: Path, cameras: tuple[str, ...] | None = None, intersect: b
     """The recording; only the headers of the videos are read. `intersect` changes nothing: nothing can be missing."""
     where = path / TABLE
     table = read_table(where, KIND)
-    try:
+    with parsing(str(where), KIND.remedy):
         source = VideosSource.from_dict(table["cameras"], path)
         fps, notes = float(table["recording"]["fps"]), tuple(table["recording"]["notes"])
         names = list(source.cameras)
         pinholes, frames = source.pinholes(), tuple(source.indices[names[0]])
-    except (KeyError, TypeError, IndexError) as failure:
-        raise D2Error(f"{where} cannot be understood ({failure!r}): {KIND.remedy}") from None
     recording = Recording(path.resolve().name, pinholes, frames, fps, source, path, notes=notes, layout="videos")
     recording = with_measured(recording, table["recording"], str(where))
     for name in names if cameras is None else [name for name in cameras if name in names]:

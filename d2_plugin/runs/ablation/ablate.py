@@ -66,7 +66,7 @@ def _work(base: RunSettings, backbone: str, preset: Preset, seed: int, output: P
     variant = prior_settings(settings).variant
     settings = replace(settings, priors=str(output / "priors" / variant))
     case = case_name(Path(settings.recording).resolve().name, settings)
-    case += f", {len(settings.frames)} frames" if settings.frames else ""
+    case += f", {len(settings.frames)} frame{'s' * (len(settings.frames) > 1)}" if settings.frames else ""
     shared = Shared(output, variant)
     share_points(settings, output)
     if preset.hooks or guidance is not None:

@@ -109,7 +109,7 @@ def rows_named(
         D2Error: neither a table nor a preset.
     """
     wanted: set[str] = set()
-    for name in names:
+    for name in names or [""]:
         if name not in tables and name not in presets:
             raise unknown_name("table or preset", name, [*tables, *presets])
         wanted.update(tables.get(name, (name,)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from statistics import mean
 from typing import NamedTuple
@@ -30,8 +31,9 @@ class Group(NamedTuple):
 
     @property
     def minutes(self) -> float:
-        """Of prior and training."""
-        return mean(row["seconds"] + (row.get("prior_seconds") or 0) for row in self.rows) / 60
+        """Of prior and training; NaN where nobody knows them, since making the prior was cut off."""
+        known = [row for row in self.rows if row.get("prior_seconds", 0.0) is not None]
+        return mean(row["seconds"] + row.get("prior_seconds", 0.0) for row in known) / 60 if known else math.nan
 
     def scores(self, column: Column) -> list[float]:
         """The scores of the runs that have one in this metric."""
@@ -78,6 +80,7 @@ def section(name: str, rows: Sequence[Row]) -> Section:
         tables.append(("Runs without a score", Table(("recording", "method", "run", "why"), cells)))
     if any(row.get("mono_emulated") for row in rows):
         text += " Monocular depth of some recordings is emulated, not predicted."
+    text += " What has no known time of its prior is not drawn." if any(math.isnan(g.minutes) for g in groups) else ""
     text += f" {EXPLANATION}" if order.rows else ""
     figures = {} if time is None else {name: _figure(groups, time)}
     return Section(name, title, text, figures, tuple(tables), sources_of(rows))
@@ -135,7 +138,7 @@ def _figure(groups: Sequence[Group], time: str) -> str:
     """PSNR over minutes, a plot for each recording; a method has one colour in all of them, and a line from length to
     length. Lengths in seconds alone where there are any, since times of two campaigns do not compare, the usual
     backbone alone, and where there are such, recordings of which all instants train."""
-    groups = [group for group in groups if f" ({_backbone(group.rows[0])})" not in group.method]
+    groups = [g for g in groups if f" ({_backbone(g.rows[0])})" not in g.method and not math.isnan(g.minutes)]
     groups = [group for group in groups if "of the instants" not in group.case] or groups
     methods = sorted({group.method for group in groups}, key=_rank)
     plots = []

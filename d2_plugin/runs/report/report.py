@@ -47,7 +47,7 @@ def run(settings: ReportSettings, builders: Mapping[str, Builder] = BUILDERS) ->
     """Make the report; how many rows it holds, and which files it is."""
     rows, images = collect(settings.sources)
     page, markdown_file, *plots = make_report(rows, settings.output, [] if settings.no_images else images, builders)
-    return f"{len(rows)} rows; open {page}, or read {markdown_file} with its {len(plots)} plots"
+    return f"open {page}, or read {markdown_file}; rows: {len(rows)}, plots: {len(plots)}"
 
 
 def make_report(

@@ -55,6 +55,7 @@ def training_row(folder: Path) -> Row:
         frames=settings.frames,
         cameras=list(metrics["train_cameras"]),
         test_cameras=metrics.get("test_cameras"),
+        images=metrics.get("images", []),
         mono_emulated=metrics.get("mono_emulated", False),
         scores=scores,
     )

@@ -104,7 +104,7 @@ def _row(work: Work, metrics: Mapping[str, Any] | None, failed: str | None = Non
         error = rms_error(scores)
         failed = None if error is not None else "no camera was held out"
         measured = {name: metrics[name] for name in ("gaussians", "background", "mono_emulated")}
-        measured |= {"scores": scores, "wall_seconds": metrics["seconds"]["train"]}
+        measured |= {"scores": scores, "wall_seconds": metrics["seconds"]["train"], "images": metrics.get("images", [])}
         if metrics.get("trials") and about.get("prior_seconds") is not None:
             about["prior_seconds"] += metrics["trials"]["cpu_seconds"]
     return make_row(

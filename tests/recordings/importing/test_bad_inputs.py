@@ -206,13 +206,16 @@ def test_a_folder_of_videos_is_no_recording_yet(given: Filmed, refused: Refused,
     assert "holds videos and no calibration that goes with them: give it with --calibration" in refused(*words)
 
 
-def test_a_video_that_moved_since_it_was_imported(given: Filmed, tmp_path: Path, refused: Refused) -> None:
+def test_a_video_that_moved_since_it_was_imported(given: Filmed, tmp_path: Path, refused, monkeypatch) -> None:
     folder = tmp_path / "lazy"
     words = ("--offsets", "none", "--images", "videos", "--frames", "0:1")
     assert main(importing(given, folder, *words)) == 0
     (given.videos / "03.mp4").rename(tmp_path / "elsewhere.mp4")
     assert "the video of camera 03 is not at" in refused("plan", folder, "--train-cameras", "all")
     assert open_recording(folder, cameras=["02"]).image("02", 0).shape == (136, 240, 3)
+    spoilt = {"cameras": {"02": {"video": {"stamps": ["soon"]}}}}
+    monkeypatch.setattr("d2_plugin.recordings.readers.videos.read_table", lambda *_: spoilt)
+    assert "videos.json (invalid literal" in refused("plan", folder, "--train-cameras", "all")
 
 
 def test_a_calibration_folder_is_not_searched_without_end(given: Filmed, tmp_path, refused, monkeypatch) -> None:

@@ -32,7 +32,8 @@ class ListedImage(NamedTuple):
 
     name: str  # its path as the file has it, without a leading ./
     matrix: np.ndarray  # [4, 4] from camera to world, OpenGL axes
-    time: float | None
+    time: float | None  # of its frame, which it was taken `late` after
+    late: float
     table: Table  # what stands beside the image, and at the top of the file where that says nothing else
 
 
@@ -52,8 +53,9 @@ def _listed(frame: Any, common: Table, place: str) -> ListedImage:
     values = numbers(table, "transform_matrix", (-1,), f"{name}, {place},").tolist()
     whole = {"transform_matrix": [*values, 0, 0, 0, 1] if len(values) == 12 else values}
     matrix = numbers(whole, "transform_matrix", (4, 4), f"{name}, {place},")
-    time = round(field(table, "time", NUMBER, place, CORRECT), TIME_DIGITS) if "time" in table else None
-    return ListedImage(name, matrix, time, {**common, **table})
+    late = field(table, "late", NUMBER, place, CORRECT, 0.0)
+    time = round(field(table, "time", NUMBER, place, CORRECT) - late, TIME_DIGITS) if "time" in table else None
+    return ListedImage(name, matrix, time, late, {**common, **table})
 
 
 def still(images: list[ListedImage]) -> bool:
