@@ -254,7 +254,9 @@ class Run:
         finally:
             self.seconds[name] += time.monotonic() - start
             self.cpu_seconds[name] += time.process_time() - cpu
-            if not self._checkpoint.exists():  # which says it later: until then a run that is cut off would forget it
+            if self._checkpoint.exists():  # which says it from now on
+                self._spent.unlink(missing_ok=True)
+            else:  # until then a run that is cut off would forget it
                 write_table(self._spent, {"seconds": [self.seconds["priors"], self.cpu_seconds["priors"]]}, COST)
 
 
