@@ -58,11 +58,14 @@ class Kind(NamedTuple):
 
 def cannot_write(path: Path, error: OSError) -> CannotWrite:
     """The sentence for a write that failed."""
+    advice = "check the disk"
+    if error.errno in FULL:
+        advice = "make room"
+    elif error.errno in FORBIDDEN:
+        advice = "choose a folder that you may write"
     reason = error.strerror or str(error)
     if error.errno in NO_PLACE:
         return CannotWrite(f"cannot write {path} ({reason}): choose another place")
-    allowed = "choose a folder that you may write" if error.errno in FORBIDDEN else "check the disk"
-    advice = "make room" if error.errno in FULL else allowed
     return CannotWrite(f"cannot write {path} ({reason}): {advice} and give the same command again, which goes on")
 
 
@@ -161,7 +164,8 @@ def refuse_foreign(path: Path, sign: str, command: str) -> None:
 
 def remove_leftovers(folder: Path, below: bool = True) -> None:
     """Delete what killed writers left in a folder, and below it; only while no other process writes there."""
-    for path in (folder.rglob if below else folder.glob)(f".*{LEFTOVER}"):
+    pattern = f".*{LEFTOVER}"
+    for path in folder.rglob(pattern) if below else folder.glob(pattern):
         with contextlib.suppress(OSError):
             path.unlink()
 
@@ -219,7 +223,8 @@ def refuse_no_file(path: Path) -> None:
 
 def _seal(table: Mapping[str, Any]) -> str:
     """SHA-256 of the values, whatever the order and the spaces of the file."""
-    return hashlib.sha256(json.dumps(table, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+    plain = json.dumps(table, sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(plain.encode()).hexdigest()
 
 
 def write_archive(path: Path, content: io.BytesIO) -> None:

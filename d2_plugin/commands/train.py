@@ -80,20 +80,24 @@ def _imported(given: Given, options: TrainOptions) -> Given:
     """What was given, with videos replaced by the recording that they become; an unfinished import goes on."""
     from d2_plugin.recordings.importing.importing import import_videos
     from d2_plugin.recordings.importing.settings import ImportChoices, ImportSettings
-    from d2_plugin.recordings.importing.video import videos_below
-    from d2_plugin.recordings.layouts import LAYOUTS
 
     videos = Path(given.values["recording"])
     if options.calibration is None:
-        recognised = any(layout.recognised(videos) for layout in LAYOUTS.values())
-        if videos.is_dir() and not recognised and videos_below(videos):
-            raise D2Error(
-                f"{videos} holds videos and no calibration that goes with them: give it with --calibration FILE, or "
-                "let `d2 import` find one first"
-            )
+        _refuse_videos(videos)
         return given
     chosen = ImportChoices.from_dict(table_of_config(given, "import"), "import")
     folder = options.output.with_name(f"{options.output.name}-recording")
     settings = ImportSettings(videos=(videos,), calibration=options.calibration, output=folder, **vars(chosen))
     import_videos(settings, report=show)
     return replace(given, values={**given.values, "recording": str(folder)})
+
+
+def _refuse_videos(path: Path) -> None:
+    from d2_plugin.recordings.importing.video import videos_below
+    from d2_plugin.recordings.layouts import LAYOUTS
+
+    if path.is_dir() and not any(layout.recognised(path) for layout in LAYOUTS.values()) and videos_below(path):
+        raise D2Error(
+            f"{path} holds videos and no calibration that goes with them: give it with --calibration FILE, or let "
+            "`d2 import` find one first"
+        )

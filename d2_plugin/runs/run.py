@@ -211,7 +211,8 @@ class Run:
         return D2Hooks(config, adapter(model), hooks=others)
 
     def _save(self, trainer: Any) -> None:
-        used = {name: getattr(self, name) for name in ("seconds", "cpu_seconds", "prior", "trials")}
+        used: dict[str, Any] = {"seconds": dict(self.seconds), "cpu_seconds": dict(self.cpu_seconds)}
+        used |= {"prior": self.prior, "trials": self.trials}
         saved.save_checkpoint(self._checkpoint, trainer.state_dict() | used)
 
     def _restore(self, trainer: Any) -> bool:
