@@ -13,9 +13,9 @@ from torch import Tensor
 from d2_plugin.errors import D2Error
 from d2_plugin.gaussians import spherical_harmonics as sh
 from d2_plugin.gaussians.moving import Harmonics, MovingGaussians
-from d2_plugin.protocol import DepthPrior, Points
-from d2_plugin.rasterizer import RasterSettings, Render, Splats, View, rasterize, survey
-from d2_plugin.settings import LearningRate, Range, Settings
+from d2_plugin.protocol import Points
+from d2_plugin.rasterizer import RasterSettings, Render, Splats, View, rasterize
+from d2_plugin.settings import LearningRate, Range, Settings, Share
 
 from .appearance import Appearance, changed
 from .background import Background
@@ -42,8 +42,8 @@ LONG = 2000
 """Steps below which that share is smaller, in proportion: a short run has still to learn."""
 LAST_RATE = 0.05
 """What is left of the learning rates at the last step."""
-HARDLY = 0.02
-"""Weight in its best pixel of all below which a Gaussian hardly shows: a fifth of them, worth .005 dB."""
+PROBES = 80
+"""At least so many images of random signs tell what Gaussians are worth to the training images."""
 
 
 @dataclass(frozen=True)
@@ -63,6 +63,9 @@ class SplatSettings(Settings):
     background: bool = True
     """Whether directions have a colour of their own at infinity, behind all Gaussians: for skies, and for what no
     training camera has seen, which is black without it."""
+    dispensable: Share = 0.01
+    """Those that the training images miss least are left out before the last steps: as many as together change these
+    images by this share of the squared error that is left. 0 keeps all that show."""
     appearance: bool = False
     """Whether each training camera has an affine change of colour of its own. `d2 train` switches it on where the
     cameras' exposures differ."""
@@ -284,18 +287,54 @@ class SplatModel(ABC):
         self.gaussians.select(index)
         self._report_resize(index)
 
-    @torch.no_grad()
-    def leave_out_hidden(self, views: Sequence[View]) -> None:
-        """Delete the Gaussians that hardly show in any of the views, nor halfway to the next instant of its camera."""
+    def leave_out_dispensable(
+        self,
+        views: Sequence[View],
+        image: Callable[[int], Tensor],
+        weights: Callable[[int], Tensor | None] = lambda index: None,
+    ) -> None:
+        """Delete the Gaussians that the views, and those halfway to the next instant of their camera, would miss least.
+
+        `settings.dispensable` says how many, by the squared error of the render of each view against `image(index)`
+        [H, W, 3], in which each pixel counts as much as `weights(index)` [H, W] says.
+        """
         ordered = sorted(views, key=lambda view: (view.camera, view.time))
         following = ordered[1:]
         between = [replace(a, time=(a.time + b.time) / 2) for a, b in zip(ordered, following) if a.camera == b.camera]
-        largest = torch.zeros(len(self), device=self.gaussians.device)
-        for view in ordered + between:
-            splats, empty = self.slice_at(view), view.K.new_zeros(view.height, view.width)
-            weights = survey(splats, view, DepthPrior(empty, empty.byte()), self.settings.raster).max_weight
-            largest.scatter_reduce_(0, splats.rows, weights, "amax")
-        self.select(torch.nonzero(largest >= HARDLY).squeeze(1))
+        energies, error = torch.zeros(len(self), device=self.gaussians.device), 0.0
+        generator, looks = torch.Generator().manual_seed(0), [*views, *between]
+        rounds = -(-PROBES // len(looks))
+        for index, view in enumerate(looks):
+            weight = weights(index) if index < len(views) else None
+            for _ in range(rounds):
+                color = self.add_energies(energies, view, generator, weight)
+            if index < len(views):
+                squares = (color - image(index)).square().sum(-1)
+                error += float((squares if weight is None else squares * weight).sum()) / len(views)
+        energies, rows = energies.sort()
+        few = energies.cumsum(0) <= self.settings.dispensable * error * rounds * len(looks)
+        self.select(rows[~few].sort().values)
+
+    def add_energies(
+        self, energies: Tensor, view: View, generator: torch.Generator, weights: Tensor | None = None
+    ) -> Tensor:
+        """Add to `energies` [N] what a view would differ by without each Gaussian; returns the view [H, W, 3].
+
+        Without Gaussian k a pixel differs by o_k dC/do_k, since its colour C is affine in every opacity. The energy of
+        that difference, summed over an image, is the mean of (o_k d<s, C>/do_k)^2 over images s of random signs
+        (Hutchinson 1990): one backward pass for all Gaussians together, and one image of signs for each call.
+        Speedy-Splat (Hanson et al. 2025) prunes by a similar sum. `weights` [H, W]: how much each pixel counts.
+        """
+        with torch.no_grad():
+            splats = self.slice_at(view)
+            colors = self.colors_seen(view, splats)
+        opacities = splats.opacities.requires_grad_()
+        color = self.behind(rasterize(splats, colors, view, self.settings.raster), view).color
+        signs = torch.randint(0, 2, color.shape, generator=generator).to(color) * 2 - 1
+        signs = signs if weights is None else signs * weights.sqrt()[..., None]
+        [gradient] = torch.autograd.grad((signs * color).sum(), opacities)
+        energies.index_add_(0, splats.rows, (opacities * gradient).detach().square())
+        return color.detach()
 
     def _report_resize(self, index: Tensor) -> None:
         for observer in self.observers:

@@ -16,8 +16,10 @@ from d2_plugin.gaussians.photometric import photometric_loss
 from d2_plugin.rasterizer import Render, View
 from d2_plugin.settings import Seed, Settings, Share, Steps
 
-PASSES = 4
-"""Steps for each training view from which on a run ends with leaving out what hardly shows: it takes a look at each."""
+DISPENSED = 0.7
+"""Share of a run after which Gaussians that the images would hardly miss go; the others make up for them."""
+PASSES = 8
+"""Steps for each training view from which on that is done: it takes a look or two at each."""
 
 
 class Model(Protocol):
@@ -29,7 +31,9 @@ class Model(Protocol):
     def accumulate(self, view: View) -> None: ...
     def optimize(self, step: int, iterations: int) -> None: ...
     def densify(self, step: int, iterations: int, generator: torch.Generator) -> None: ...
-    def leave_out_hidden(self, views: Sequence[View]) -> None: ...
+    def leave_out_dispensable(
+        self, views: Sequence[View], image: Callable[[int], Tensor], weights: Callable[[int], Tensor | None]
+    ) -> None: ...
     def state_dict(self) -> dict[str, Any]: ...
     def load_state_dict(self, state: Mapping[str, Any]) -> None: ...
 
@@ -110,8 +114,8 @@ class Trainer:
             model.densify(self.step, iterations, self._generator)
             if d2 is not None:
                 d2.step(self.step)  # D2, line 3: after the optimizer's step and zero_grad
-            if self.step == iterations >= PASSES * len(self.frames.views):
-                model.leave_out_hidden(self.frames.views)
+            if self.step == round(DISPENSED * iterations) and iterations >= PASSES * len(self.frames.views):
+                model.leave_out_dispensable(self.frames.views, self.frames.image, self._weights)
             if on_step:
                 on_step(self.step, logged)
 
