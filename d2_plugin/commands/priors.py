@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +37,7 @@ def form(words: list[str]) -> Form:
 
 def run(given: Given) -> str:
     """Build what is missing; returns a summary of the frames."""
-    from d2_plugin.durable import CannotWrite
+    from d2_plugin.durable import CannotWrite, make_folder
     from d2_plugin.locks import in_turn
     from d2_plugin.priors.declared_error import frames_with_truth, held_against_truth
     from d2_plugin.priors.sheet import contact_sheet
@@ -50,8 +50,9 @@ def run(given: Given) -> str:
 
     options = given.make(PriorOptions)
     shard, cluster = part_of(options.shard), cluster_of(options)
-    settings = check(run_settings(given))
+    settings = check(replace(run_settings(given), test_cameras=()))  # which may have no images yet
     scene = Scene.open(settings)
+    make_folder(options.output)  # or say at once that it cannot be
     show_notes(scene.recording.notes)
     show_plan(scene.plan)
     points = triangulated_points(scene.recording, scene.train_cameras)

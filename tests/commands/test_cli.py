@@ -76,7 +76,9 @@ def test_priors_are_built_in_parts_and_shown_on_a_sheet(
     recording, finished, tmp_path, capsys, answered, monkeypatch
 ) -> None:
     monkeypatch.setattr("d2_plugin.runs.prior.trials.STEPS", 10)
-    build = ["priors", str(recording), "--train-cameras", CAMERAS, "--output", str(tmp_path)]
+    copy, tmp_path = shutil.copytree(recording, tmp_path / recording.name), tmp_path / "priors"
+    shutil.rmtree(copy / "images" / "test0")  # it does not train: no image of it is needed
+    build = ["priors", str(copy), "--train-cameras", CAMERAS, "--output", str(tmp_path)]
     assert main([*build, "--shard", "2/2"]) == 0
     assert not (tmp_path / "contact_sheet.png").exists()
     told = capsys.readouterr().out
