@@ -39,7 +39,7 @@ COLOR_RATE = 1e-2
 SETTLING = 0.3
 """Share of a run, at its end, in which all learning rates fall: Gaussians that follow each image come to rest."""
 LONG = 2000
-"""Steps below which that share is smaller, in proportion: a short run has still to learn."""
+"""Steps below which that share is smaller, in proportion, and `dispensable` as well: a short run has still to learn."""
 LAST_RATE = 0.05
 """What is left of the learning rates at the last step."""
 PROBES = 80
@@ -65,7 +65,7 @@ class SplatSettings(Settings):
     training camera has seen, which is black without it."""
     dispensable: Share = 0.01
     """Those that the training images miss least are left out before the last steps: as many as together change these
-    images by this share of the squared error that is left. 0 keeps all that show."""
+    images by this share of the squared error that is left, by less of it in a short run. 0 keeps all that show."""
     appearance: bool = False
     """Whether each training camera has an affine change of colour of its own. `d2 train` switches it on where the
     cameras' exposures differ."""
@@ -289,14 +289,15 @@ class SplatModel(ABC):
 
     def leave_out_dispensable(
         self,
+        iterations: int,
         views: Sequence[View],
         image: Callable[[int], Tensor],
         weights: Callable[[int], Tensor | None] = lambda index: None,
     ) -> None:
         """Delete the Gaussians that the views, and those halfway to the next instant of their camera, would miss least.
 
-        `settings.dispensable` says how many, by the squared error of the render of each view against `image(index)`
-        [H, W, 3], in which each pixel counts as much as `weights(index)` [H, W] says.
+        `settings.dispensable` says how many in a run of `LONG` iterations, by the squared error of the render of each
+        view against `image(index)` [H, W, 3], in which each pixel counts as much as `weights(index)` [H, W] says.
         """
         ordered = sorted(views, key=lambda view: (view.camera, view.time))
         following = ordered[1:]
@@ -312,7 +313,8 @@ class SplatModel(ABC):
                 squares = (color - image(index)).square().sum(-1)
                 error += float((squares if weight is None else squares * weight).sum()) / len(views)
         energies, rows = energies.sort()
-        few = energies.cumsum(0) <= self.settings.dispensable * error * rounds * len(looks)
+        share = self.settings.dispensable * min(iterations / LONG, 1.0)
+        few = energies.cumsum(0) <= share * error * rounds * len(looks)
         self.select(rows[~few].sort().values)
 
     def add_energies(

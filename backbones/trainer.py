@@ -32,7 +32,11 @@ class Model(Protocol):
     def optimize(self, step: int, iterations: int) -> None: ...
     def densify(self, step: int, iterations: int, generator: torch.Generator) -> None: ...
     def leave_out_dispensable(
-        self, views: Sequence[View], image: Callable[[int], Tensor], weights: Callable[[int], Tensor | None]
+        self,
+        iterations: int,
+        views: Sequence[View],
+        image: Callable[[int], Tensor],
+        weights: Callable[[int], Tensor | None],
     ) -> None: ...
     def state_dict(self) -> dict[str, Any]: ...
     def load_state_dict(self, state: Mapping[str, Any]) -> None: ...
@@ -115,7 +119,7 @@ class Trainer:
             if d2 is not None:
                 d2.step(self.step)  # D2, line 3: after the optimizer's step and zero_grad
             if self.step == round(DISPENSED * iterations) and iterations >= PASSES * len(self.frames.views):
-                model.leave_out_dispensable(self.frames.views, self.frames.image, self._weights)
+                model.leave_out_dispensable(iterations, self.frames.views, self.frames.image, self._weights)
             if on_step:
                 on_step(self.step, logged)
 

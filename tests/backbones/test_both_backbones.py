@@ -189,7 +189,7 @@ def test_what_images_would_hardly_miss_is_left_out(backbone: str) -> None:
         model.gaussians["log_time_scales"][[0, 1, 3]] = 3.0
     between = [replace(view, time=0.25) for view in views[:3]]
     before = [model.render(view).color.detach() for view in views + between]
-    model.leave_out_dispensable(views, lambda index: before[index] + 0.05)
+    model.leave_out_dispensable(2000, views, lambda index: before[index] + 0.05)
     assert len(model) == 3
     torch.testing.assert_close(model.gaussians["positions"].detach()[:, 2], torch.tensor([2.0, 1, 1]))
     for view, image in zip(views + between, before, strict=True):
@@ -203,7 +203,7 @@ def test_no_more_is_left_out_than_the_images_can_spare(backbone: str) -> None:
         model = make_model(backbone=backbone, dispensable=share)
         images = [model.render(view).color.detach() for view in views]
         targets, counting = [image + 0.2 for image in images], torch.full_like(images[0][..., 0], weight)
-        model.leave_out_dispensable(views, targets.__getitem__, dict.fromkeys(range(len(views)), counting).get)
+        model.leave_out_dispensable(2000, views, targets.__getitem__, dict.fromkeys(range(len(views)), counting).get)
         left[share, weight] = len(model)
         change = sum((model.render(view).color - image).square().sum() for view, image in zip(views, images))
         assert weight == 0 or change <= 3 * share * sum(image.numel() * 0.2**2 for image in images)
@@ -212,7 +212,7 @@ def test_no_more_is_left_out_than_the_images_can_spare(backbone: str) -> None:
 
 def test_images_that_are_not_finite_leave_all_gaussians(backbone: str) -> None:
     model = make_model(backbone=backbone)
-    model.leave_out_dispensable(make_views(), lambda index: torch.tensor(math.nan))
+    model.leave_out_dispensable(2000, make_views(), lambda index: torch.tensor(math.nan))
     assert len(model) == 60
 
 
@@ -231,7 +231,7 @@ def test_a_run_of_eight_steps_for_each_view_takes_a_look_at_each(backbone, itera
 def test_training_lowers_the_loss_of_the_tiny_scene(backbone: str) -> None:
     losses: list[float] = []
     make_trainer(iterations=100, backbone=backbone).run(on_step=lambda step, loss: losses.append(loss))
-    assert sum(losses[-6:]) < 0.5 * sum(losses[:6])
+    assert sum(losses[-6:]) < 0.6 * sum(losses[:6])
 
 
 def test_without_time_these_are_ordinary_3d_gaussians(backbone: str) -> None:
