@@ -39,7 +39,7 @@ COLOR_RATE = 1e-2
 SETTLING = 0.3
 """Share of a run, at its end, in which all learning rates fall: Gaussians that follow each image come to rest."""
 LONG = 2000
-"""Steps below which that share is smaller, in proportion, and `dispensable` as well: a short run has still to learn."""
+"""Steps below which that share falls in proportion, and `dispensable` by the square: a short run has still to learn."""
 LAST_RATE = 0.05
 """What is left of the learning rates at the last step."""
 PROBES = 80
@@ -313,7 +313,7 @@ class SplatModel(ABC):
                 squares = (color - image(index)).square().sum(-1)
                 error += float((squares if weight is None else squares * weight).sum()) / len(views)
         energies, rows = energies.sort()
-        share = self.settings.dispensable * min(iterations / LONG, 1.0)
+        share = self.settings.dispensable * min(iterations / LONG, 1.0) ** 2
         few = energies.cumsum(0) <= share * error * rounds * len(looks)
         self.select(rows[~few].sort().values)
 

@@ -167,8 +167,9 @@ def test_what_an_image_differs_by_without_each_gaussian(backbone: str) -> None:
             logits[row] = logit
     assert torch.equal(energies > 0, true > 0)
     seen = true > 0.01 * true.max()
-    assert seen.sum() > 5
+    assert seen.sum() > 10
     assert (energies[seen] / 100 / true[seen]).log2().abs().median() < 0.3
+    assert torch.corrcoef(torch.stack([energies, true]).argsort(1).argsort(1).float())[0, 1] > 0.95
 
 
 def test_what_images_would_hardly_miss_is_left_out(backbone: str) -> None:
@@ -231,7 +232,7 @@ def test_a_run_of_eight_steps_for_each_view_takes_a_look_at_each(backbone, itera
 def test_training_lowers_the_loss_of_the_tiny_scene(backbone: str) -> None:
     losses: list[float] = []
     make_trainer(iterations=100, backbone=backbone).run(on_step=lambda step, loss: losses.append(loss))
-    assert sum(losses[-6:]) < 0.6 * sum(losses[:6])
+    assert sum(losses[-6:]) < 0.5 * sum(losses[:6])
 
 
 def test_without_time_these_are_ordinary_3d_gaussians(backbone: str) -> None:
