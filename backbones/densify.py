@@ -48,7 +48,7 @@ class DensifySettings(Settings):
     """Share of the run after which there are no more edits."""
     every: Every = 100
     """Steps between edits."""
-    gradient: Annotated[float, Range(0, 1e6)] = 1e-3
+    gradient: Annotated[float, Range(0, 1e6)] = 5e-4
     """Mean screen-space gradient (in units of half the image) above which a Gaussian is cloned or split. The official
     2e-4 overfits where there are few views."""
     budget: Count = 100_000
