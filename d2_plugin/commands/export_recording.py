@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 from d2_plugin.protocol import EXPORT_FILE
 from d2_plugin.reading import read_json
 from d2_plugin.recordings import Recording, open_recording, select_cameras
+from d2_plugin.recordings.export.base import unused_folder
 from d2_plugin.recordings.export.export import export_recording
 from d2_plugin.recordings.export.ply import PointCloud
 from d2_plugin.runs.start import MIN_POINTS, initial_points, scene_extent, triangulated_points
@@ -42,6 +43,7 @@ class RecordingExport(Settings):
 
 def run(settings: RecordingExport) -> str:
     """Write the recording; returns what was written and where."""
+    unused_folder(settings.output)  # or say so at once
     recording = open_recording(settings.recording, frames=settings.frames, downscale=settings.downscale)
     held_out = settings.test_cameras
     train = settings.train_cameras or tuple(name for name in recording.cameras if name not in held_out)

@@ -67,6 +67,14 @@ def refuse_off_centre(camera: Camera, layout: str) -> None:
         )
 
 
+def unused_folder(path: Path | str) -> Path:
+    """Where `path` leads, which holds nothing yet; a `D2Error` if it does."""
+    folder = Path(os.path.realpath(path))
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise D2Error(f"{path} already exists and is not empty: choose another folder, nothing was written")
+    return folder
+
+
 @contextmanager
 def whole_folder(path: Path | str) -> Iterator[Path]:
     """Within it, a folder to write to, which takes the place of `path` at the end: there is all of it, or nothing.
@@ -77,9 +85,7 @@ def whole_folder(path: Path | str) -> Iterator[Path]:
     Raises:
         D2Error: `path` holds something, somebody else is writing it, or the disk is full, broken or not ours.
     """
-    folder = Path(os.path.realpath(path))
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise D2Error(f"{path} already exists and is not empty: choose another folder, nothing was written")
+    folder = unused_folder(path)
     if folder == Path.cwd() or folder.is_mount():
         with only_writer(folder), writing(folder):
             yield folder
