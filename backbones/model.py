@@ -56,7 +56,7 @@ class SplatSettings(Settings):
     """Degree of the view-dependent colour."""
     position_rate: Annotated[float, Range(1e-9, 100)] = 3e-4
     """Learning rate of positions at the first step, times the extent of the scene."""
-    scale_rate: LearningRate = 1e-2
+    scale_rate: LearningRate = 2e-2
     """Learning rate of log-scales."""
     opacity_rate: LearningRate = 5e-2
     """Learning rate of opacity logits."""
