@@ -62,6 +62,11 @@ def run(settings: Export) -> str:
         )
     if not 1 <= len(settings.runs) <= (2 if settings.format == "html" else 1):
         raise D2Error(f"{len(settings.runs)} runs are given: give one, or for a page of html one or two")
+    if settings.format in CONVERTED and shutil.which(CONVERTER) is None:
+        raise D2Error(
+            f"{settings.format} is written by {CONVERTER}, which is not installed: run `npm install -g "
+            f"@playcanvas/{CONVERTER}`, or choose --format ply"
+        )
     checkpoint = settings.recording, settings.train_cameras, settings.downscale
     shown, path = [open_viewed(path, *checkpoint) for path in settings.runs], settings.runs[-1]
     if settings.keep < 1:
@@ -113,15 +118,11 @@ def _frame_files(scene: ExportScene, settings: Export, folder: Path) -> list[Pat
 
 
 def _convert(ply: Path, path: Path) -> None:
-    program = shutil.which(CONVERTER)
-    if program is None:
-        raise D2Error(
-            f"{path.suffix[1:]} is written by {CONVERTER}, which is not installed: run `npm install -g "
-            f"@playcanvas/{CONVERTER}`, or choose --format ply"
-        )
+    program = shutil.which(CONVERTER) or CONVERTER
     done = subprocess.run([program, "-q", "-w", "-g", "cpu", str(ply), str(path)], capture_output=True, text=True)
     if done.returncode or not path.is_file():
         raise D2Error(f"{CONVERTER} cannot write {path} ({done.stderr[-300:].strip()}): choose --format ply")
 
 
-FRAME_FORMATS = ("ply", "sog", "spz", "glb")  # of single instants
+CONVERTED = ("sog", "spz", "glb")
+FRAME_FORMATS = ("ply", *CONVERTED)  # of single instants
