@@ -327,14 +327,15 @@ def test_the_cameras_that_the_network_saw_may_be_more_and_in_another_order(room,
     other = write_multiview(room, ["train2", "train0", "train1"], tmp_path / "maps", posed=True)
     (other / "multiview.json").write_text('{"cameras": ["train2", "train0", "train1"], "emulated": true}')
     settings = replace(ALONE, multiview=str(other))
-    build_priors(room, NAMES[:2], tmp_path / "prior", settings)
+    few = replace(room, cameras={name: room.cameras[name] for name in NAMES[:2]})
+    build_priors(few, NAMES[:2], tmp_path / "prior", settings)
     store = PriorStore.open(tmp_path / "prior")
     truth, prior = room.depth("train0", 0), store.prior("train0", 0)
     known = (prior.depth > 0).numpy()
     assert np.median(np.abs(np.log(prior.depth.numpy()[known] / truth[known]))) < 0.05
     assert "emulated" in store.record("train0", 0)["several"]
     (other / "multiview.json").write_text('{"cameras": ["train2", "trian0", "train1"]}')
-    refuses("trian0", build_priors, room, NAMES[:2], tmp_path / "prior", settings)
+    refuses("'train0': have train1, train2, trian0", build_priors, few, NAMES[:2], tmp_path / "prior", settings)
 
 
 def test_a_network_of_so_many_views_refuses_another_number_and_runs_once_a_frame(room, tmp_path, monkeypatch) -> None:

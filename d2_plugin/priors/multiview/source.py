@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from d2_plugin.errors import D2Error, unknown_name
+from d2_plugin.errors import D2Error, refuse_unknown
 from d2_plugin.priors.frame import Frame, digest
 from d2_plugin.priors.maps_on_disk import planar
 from d2_plugin.priors.monocular.network import MonocularModel
@@ -83,18 +83,16 @@ class MultiviewSource:
             self.files, self._fingerprint = {}, self.model.fingerprint()
         else:
             self.files = prediction_files(path)
-            self._read_order(declared(path).get("cameras"), path, recording)
+            self._read_order(declared(path).get("cameras"), path)
         self.entries = EntryFolder(cache, synced=False)
         self.about = multiview_about(path)
 
-    def _read_order(self, cameras: Any, folder: Path, recording: Recording) -> None:
+    def _read_order(self, cameras: Any, folder: Path) -> None:
         if cameras is None:
             return
         if not isinstance(cameras, list) or not cameras:
             raise D2Error(f"{folder}/multiview.json has cameras {shown(cameras)}, expected a list of names: correct it")
-        for name in (*cameras, *self.cameras):
-            if name not in recording.cameras or name not in cameras:
-                raise unknown_name(f"camera in {folder}/multiview.json", str(name)[:40], recording.cameras)
+        refuse_unknown(f"camera to {folder}/multiview.json", self.cameras, cameras)
         self.orders = [cameras]
 
     def has(self, frame: int) -> bool:
