@@ -335,7 +335,7 @@ def test_the_cameras_that_the_network_saw_may_be_more_and_in_another_order(room,
     assert np.median(np.abs(np.log(prior.depth.numpy()[known] / truth[known]))) < 0.05
     assert "emulated" in store.record("train0", 0)["several"]
     (other / "multiview.json").write_text('{"cameras": ["train2", "trian0", "train1"]}')
-    refuses("'train0': have train1, train2, trian0", build_priors, few, NAMES[:2], tmp_path / "prior", settings)
+    refuses("lacks camera 'train0', it has", build_priors, few, NAMES[:2], tmp_path / "prior", settings)
 
 
 def test_a_network_of_so_many_views_refuses_another_number_and_runs_once_a_frame(room, tmp_path, monkeypatch) -> None:

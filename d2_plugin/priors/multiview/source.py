@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from d2_plugin.errors import D2Error, refuse_unknown
+from d2_plugin.errors import D2Error
 from d2_plugin.priors.frame import Frame, digest
 from d2_plugin.priors.maps_on_disk import planar
 from d2_plugin.priors.monocular.network import MonocularModel
@@ -92,7 +92,9 @@ class MultiviewSource:
             return
         if not isinstance(cameras, list) or not cameras:
             raise D2Error(f"{folder}/multiview.json has cameras {shown(cameras)}, expected a list of names: correct it")
-        refuse_unknown(f"camera to {folder}/multiview.json", self.cameras, cameras)
+        missing = [name for name in self.cameras if name not in cameras]
+        if missing:
+            raise D2Error(f"{folder}/multiview.json lacks camera '{missing[0]}', it has {shown(cameras)}: correct it")
         self.orders = [cameras]
 
     def has(self, frame: int) -> bool:

@@ -124,5 +124,5 @@ def _convert(ply: Path, path: Path) -> None:
         raise D2Error(f"{CONVERTER} cannot write {path} ({done.stderr[-300:].strip()}): choose --format ply")
 
 
-CONVERTED = ("sog", "spz", "glb")
+CONVERTED = ("sog", "spz", "glb")  # by CONVERTER
 FRAME_FORMATS = ("ply", *CONVERTED)  # of single instants
