@@ -215,11 +215,8 @@ def test_every_number_among_the_settings_is_one_and_has_both_bounds_and_every_de
             assert kind.from_dict(plain) == kind()
 
 
-RUN = RunSettings("room", ("a",))
-
-
 def run(table: dict[str, Any]) -> RunSettings:
-    return check(replace(RUN, **table))
+    return check(RunSettings("room", ("a",), **table))
 
 
 @pytest.mark.parametrize(
@@ -232,6 +229,7 @@ def run(table: dict[str, Any]) -> RunSettings:
         (PriorSettings.from_dict, {"stereo": {"min_angle": 60.0}}, "min_angle must be below max_angle, got 60 and 60"),
         (run, {"overrides": {"plan": {"temporl": True}}}, r"unknown decision of plan 'temporl'.*did you mean 'tempor"),
         (run, {"overrides": {"d2": {"densify": 5}}}, r"d2\.densify is a table of its own"),
+        (run, {"overrides": {"training": {"seed": 5}}}, r"training\.seed is a setting of the run: give it as --seed"),
         (run, {"overrides": {"prunes": {}}}, r"unknown table 'prunes'.*did you mean 'prune'"),
     ],
 )

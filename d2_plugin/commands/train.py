@@ -21,7 +21,8 @@ OF_THE_RUN = (
     *("test_cameras", "backbone", "iterations", "hooks", "priors", "accept_empty_prior"),
     *("hold_out_instants", "background_weight", "seed", "device"),
 )
-TABLES = ("densify", "prune", "depth_loss", "motion", "parallax", "d2", "priors", "backbone", "plan", "import")
+HOOKS = ("densify", "prune", "depth_loss", "motion", "parallax")
+TABLES = (*HOOKS, "d2", "priors", "backbone", "training", "plan", "import")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,7 +16,7 @@ from d2_plugin.recordings.cameras.check import check_background_weight, check_re
 from d2_plugin.recordings.checks.memory import check_memory
 from d2_plugin.runs.metrics import GAUSSIAN_WINDOW
 from d2_plugin.runs.plan import ScenePlan, appearance_decision, plan_scene
-from d2_plugin.runs.settings import RunSettings, hooks_in_use, prior_settings
+from d2_plugin.runs.settings import RunSettings, hooks_in_use, prior_settings, training_settings
 from d2_plugin.runs.start import TimedPoints, TrainingFrames, begin_with_exposures, initial_points, scene_extent
 
 
@@ -113,8 +113,7 @@ class Scene:
         )
         begin_with_exposures(model, recording, cameras, self.test_cameras)
         images = TrainingFrames(recording, cameras, settings.device, settings.background_weight)
-        training = backbone.TrainSettings(iterations=settings.iterations, seed=settings.seed)
-        return backbone.Trainer(model, images, training, attach)
+        return backbone.Trainer(model, images, training_settings(settings, backbone), attach)
 
 
 class Guidance(Protocol):

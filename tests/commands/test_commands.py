@@ -12,13 +12,14 @@ from command_lines import form_of
 from stand_in_recordings import renamed
 
 from d2_plugin import progress
+from d2_plugin.backbones import yang4d
 from d2_plugin.commands.arguments.form import Given
 from d2_plugin.commands.cli import COMMANDS, main
 from d2_plugin.config import DensifyConfig
 from d2_plugin.recordings.export.folder import save_recording
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.runs.run import Run
-from d2_plugin.runs.settings import hook_config, prior_settings
+from d2_plugin.runs.settings import hook_config, prior_settings, training_settings
 
 CAMERAS = ["--train-cameras", "train0,train1,train2"]
 
@@ -81,6 +82,7 @@ class TestTables:
         )
         flags = "--densify.budget-per-view 500 --priors.stereo.min-angle 2 --backbone.sh-degree 1 --plan.temporal false"
         words = [str(recording), *CAMERAS, "--config", str(config), *flags.split(), "--d2.retire-after", "0"]
+        words += ["--training.ssim-weight", "0.5"]
         output = tmp_path / "run"
         assert main(["train", *words, "--iterations", "4", "--hooks", "none", "--output", str(output)]) == 0
         settings = Run.load(output).settings
@@ -89,16 +91,15 @@ class TestTables:
         assert densify.tau_v == DensifyConfig().tau_v
         prior = prior_settings(settings)
         assert (prior.stereo.min_angle, prior.tau_c) == (2.0, 0.05)
-        assert settings.overrides["backbone"] == {"sh_degree": 1}
-        assert settings.overrides["d2"] == {"retire_after": 0}
+        assert (settings.overrides["backbone"], settings.overrides["d2"]) == ({"sh_degree": 1}, {"retire_after": 0})
+        assert training_settings(settings, yang4d) == yang4d.TrainSettings(iterations=4, ssim_weight=0.5)
         metrics = json.loads((output / "metrics.json").read_text())
         assert metrics["plan"]["temporal"]["use"] is False
 
     def test_the_tables_of_a_backbone_are_those_of_the_chosen_one(self, refused) -> None:
         words = ["room", *CAMERAS, "--output", "x"]
-        assert parsed("train", *words, "--backbone", "deform", "--backbone.seed", "3").tables == {
-            "backbone": {"seed": 3}
-        }
+        given = parsed("train", *words, "--backbone", "deform", "--backbone.seed", "3")
+        assert given.tables == {"backbone": {"seed": 3}}
         assert "did you mean --backbone.sh-time-degree?" in refused("train", *words, "--backbone.sh-time-degre", "1")
         assert "unknown flag --backbone.sh-time-degree" in refused(
             "train", *words, "--backbone", "deform", "--backbone.sh-time-degree", "1"

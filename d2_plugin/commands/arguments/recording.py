@@ -86,6 +86,7 @@ def all_tables(backbone: str) -> dict[str, Group]:
         "d2": Group(D2Config, (*hooks, "exported", "iterations")),  # for other trainers
         "priors": Group(PriorSettings),
         "backbone": Group(type(module.settings_from({})), ("raster",)),  # constants of splatting: in a file alone
+        "training": Group(module.TrainSettings, ("iterations", "seed")),
         "plan": Group(PlanChoices),
         "import": Group(ImportChoices),
     }

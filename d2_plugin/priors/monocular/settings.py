@@ -10,7 +10,7 @@ from d2_plugin.settings import Count, Range, Settings, Share
 
 @dataclass(frozen=True)
 class AlignSettings(Settings):
-    """Alignment of monocular to geometric depth (docs/priors.md)."""
+    """Monocular depth aligned to geometric."""
 
     residual: Literal["relative", "absolute"] = "relative"
     """`absolute` is the paper's a D^m + b - D^g; `relative` divides it by D^g, as verification does."""
