@@ -226,7 +226,7 @@ def _view_prior(prepared: _Prepared, several: _Prepared | None, settings: PriorS
     if settings.far and settings.variant == "dual" and not mono.refused:
         maps = _with_far(maps, mono, prepared)
     if view.recorded is not None:
-        maps = _within(maps, view.recorded)
+        maps = _relabelled(maps, ~view.recorded, 0, Label.EMPTY)  # nothing is known of what was not recorded
     stored = {} if view.geometric is None else view.geometric.record
     about_stereo = {key: value for key, value in stored.items() if key != "checksum"} or None
     about_several = None
@@ -308,13 +308,13 @@ def _fused(mono: _AlignedMap, prepared: _Prepared, settings: PriorSettings) -> F
     )
 
 
-def _within(maps: FusedPrior, recorded: np.ndarray) -> FusedPrior:
-    """Nothing is known of pixels that were not recorded."""
+def _relabelled(maps: FusedPrior, pixels: np.ndarray, depth: float, label: Label) -> FusedPrior:
+    """One depth and one label at some pixels, with no bound on the error."""
     return replace(
         maps,
-        depth=np.where(recorded, maps.depth, np.float32(0)),
-        labels=np.where(recorded, maps.labels, np.uint8(Label.EMPTY)),
-        sigma=np.where(recorded, maps.sigma, np.float32(np.inf)),
+        depth=np.where(pixels, np.float32(depth), maps.depth),
+        labels=np.where(pixels, np.uint8(label), maps.labels),
+        sigma=np.where(pixels, np.float32(np.inf), maps.sigma),
     )
 
 
@@ -324,11 +324,4 @@ def _with_far(maps: FusedPrior, mono: _AlignedMap, prepared: _Prepared) -> Fused
     if prediction is None or alignment is None:
         return maps
     far = far_pixels(aligned_inverse(prediction, alignment), prepared.depth, prepared.view.image)
-    if not far.any():
-        return maps
-    return replace(
-        maps,
-        depth=np.where(far, np.float32(mono.farthest), maps.depth),
-        labels=np.where(far, np.uint8(Label.FAR), maps.labels),
-        sigma=np.where(far, np.float32(np.inf), maps.sigma),
-    )
+    return _relabelled(maps, far, mono.farthest, Label.FAR)
