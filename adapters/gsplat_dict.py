@@ -70,6 +70,9 @@ class GsplatAdapter(Resizing):
         for name in ("means", "scales", "quats", "opacities"):
             if name not in parameters:
                 raise D2Error(f"parameters have {', '.join(parameters)} but no '{name}', which gsplat's names include")
+        for name in parameters:
+            if optimizers and name not in optimizers:  # none at all is for who renders only
+                raise D2Error(f"parameter '{name}' has no optimizer: give the adapter one of each, as gsplat has")
         self.parameters, self.optimizers, self.state = parameters, optimizers, state
         self.settings = settings
         self._view = view if parser is None else ViewsByPose(parser)

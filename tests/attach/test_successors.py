@@ -65,6 +65,7 @@ class TestGsplat:
         adapter = GsplatAdapter(splats, optimizers, new_rows=lambda points: {"velocities": 0 * points.positions})
         assert adapter.insert(some_points(2)) == 2
         refuses("have means but no 'scales'", GsplatAdapter, {"means": splats["means"]}, optimizers)
+        refuses("'times' has no optimizer", GsplatAdapter, {**splats, "times": splats["means"]}, optimizers)
 
     def test_a_scene_is_told_of_rows_that_come_and_go(self) -> None:
         """gsplat 1.6 keeps a component per row beside the parameters, and its own split fails where one is missing."""
