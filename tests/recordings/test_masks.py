@@ -10,7 +10,7 @@ from refusals import refuses
 from small_layouts import small_recording
 
 from d2_plugin.gaussians.photometric import photometric_loss, weighted_photometric_loss
-from d2_plugin.priors.construct import _within
+from d2_plugin.priors.construct import _relabelled
 from d2_plugin.priors.fuse import fuse
 from d2_plugin.protocol import Label
 from d2_plugin.recordings import open_recording
@@ -177,7 +177,7 @@ def test_a_prior_knows_nothing_of_what_was_not_recorded() -> None:
     maps = fuse(full, full, tau_c=0.1)
     assert (maps.labels == Label.VERIFIED).all()
     recorded = left_half() > 0
-    kept = _within(maps, recorded)
+    kept = _relabelled(maps, ~recorded, 0, Label.EMPTY)
     assert (kept.labels[recorded] == Label.VERIFIED).all()
     assert (kept.labels[~recorded] == Label.EMPTY).all()
     assert (kept.depth[~recorded] == 0).all()
