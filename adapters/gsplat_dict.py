@@ -71,7 +71,7 @@ class GsplatAdapter(Resizing):
             if name not in parameters:
                 raise D2Error(f"parameters have {', '.join(parameters)} but no '{name}', which gsplat's names include")
         for name in parameters:
-            if optimizers and name not in optimizers:  # none at all is for who renders only
+            if optimizers and name not in optimizers:  # without any, it only renders
                 raise D2Error(f"parameter '{name}' has no optimizer: give the adapter one of each, as gsplat has")
         self.parameters, self.optimizers, self.state = parameters, optimizers, state
         self.settings = settings

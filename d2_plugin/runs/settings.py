@@ -151,8 +151,9 @@ def training_settings(settings: RunSettings, backbone: Any) -> Any:
     """Length and seed of the run beside what the user's table says of the loss, as the backbone has them."""
     own = {"iterations": settings.iterations, "seed": settings.seed}
     table = _over({}, settings.overrides.get("training", {}), "training")
-    for name in {*own} & {*table}:
-        raise D2Error(f"training.{name} is a setting of the run: give it as --{name}")
+    for name in table:
+        if name in own:
+            raise D2Error(f"training.{name} is a setting of the run: give it as --{name}")
     return backbone.TrainSettings.from_dict({**table, **own}, "training")
 
 
@@ -172,8 +173,9 @@ def hook_config(settings: RunSettings, priors: Path) -> D2Config:
     """The hooks of a run with schedules that fit its length, and the user's tables over the defaults."""
     hooks = hooks_in_use(settings)
     d2 = settings.overrides.get("d2", {})
-    for name in {*HOOKS} & ({*d2} if isinstance(d2, Mapping) else set()):
-        raise D2Error(f"d2.{name} is a table of its own: write its settings under [{name}]")
+    for name in d2 if isinstance(d2, Mapping) else ():
+        if name in HOOKS:
+            raise D2Error(f"d2.{name} is a table of its own: write its settings under [{name}]")
     config = for_iterations(hooks, settings.iterations, prior=str(priors), seed=settings.seed)
     plain = {name: value for name, value in asdict(config).items() if name not in HOOKS}
     tables = {name: _over(asdict(getattr(config, name)), settings.overrides.get(name, {}), name) for name in hooks}

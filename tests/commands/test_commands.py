@@ -19,7 +19,7 @@ from d2_plugin.config import DensifyConfig
 from d2_plugin.recordings.export.folder import save_recording
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.runs.run import Run
-from d2_plugin.runs.settings import hook_config, prior_settings, training_settings
+from d2_plugin.runs.settings import hook_config, prior_settings
 
 CAMERAS = ["--train-cameras", "train0,train1,train2"]
 
@@ -92,7 +92,7 @@ class TestTables:
         prior = prior_settings(settings)
         assert (prior.stereo.min_angle, prior.tau_c) == (2.0, 0.05)
         assert (settings.overrides["backbone"], settings.overrides["d2"]) == ({"sh_degree": 1}, {"retire_after": 0})
-        assert training_settings(settings, yang4d) == yang4d.TrainSettings(iterations=4, ssim_weight=0.5)
+        assert Run.load(output).trained().settings == yang4d.TrainSettings(iterations=4, ssim_weight=0.5)
         metrics = json.loads((output / "metrics.json").read_text())
         assert metrics["plan"]["temporal"]["use"] is False
 
