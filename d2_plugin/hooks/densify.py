@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from d2_plugin.hooks.expected import check_splats
-from d2_plugin.hooks.hook import Context, Hook, HookConfig, Surveyed, steps_between_evaluations
+from d2_plugin.hooks.hook import Context, Hook, HookConfig, Surveyed
 from d2_plugin.protocol import DepthPrior, Edit, Label, Points, Splats, View
 from d2_plugin.settings import Count, Every, Positive, Range, Share, Steps
 
@@ -80,7 +80,7 @@ class DensifyConfig(HookConfig):
     @classmethod
     def for_iterations(cls, iterations: int) -> DensifyConfig:
         """Insertion from the first fortieth to half of the run, in numbers that the run has time to train."""
-        every = steps_between_evaluations(iterations)
+        every = max(5, min(100, iterations // 10))  # an evaluation costs as much as several steps
         start = max(1, min(every, iterations // 40))
         budget = max(10 * iterations, 200 * every)
         return cls(start=start, stop=max(iterations // 2, every + 1), every=every, budget_per_view=budget)

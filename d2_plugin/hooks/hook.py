@@ -52,12 +52,6 @@ class HookConfig(Settings):
         return math.inf if self.stop is None else max(0, -(-(self.stop - step) // self.every))
 
 
-def steps_between_evaluations(iterations: int) -> int:
-    """Of hooks that edit structure: a hundred; a twentieth of a run below 2000 steps, ten below 200, a tenth below 100,
-    and no fewer than five. An evaluation costs as much as several steps."""
-    return max(5, min(10, iterations // 10), min(100, iterations // 20))
-
-
 class Surveyed(NamedTuple):
     """One view of an evaluation: its sliced Gaussians, its prior, and the compositing weights."""
 

@@ -10,13 +10,9 @@ import torch
 from torch import Tensor
 
 from d2_plugin.hooks.densify import EPSILON
-from d2_plugin.hooks.hook import Context, Hook, HookConfig, Surveyed, steps_between_evaluations
+from d2_plugin.hooks.hook import Context, Hook, HookConfig, Surveyed
 from d2_plugin.protocol import Edit, View
 from d2_plugin.settings import Every, Range, Share, Steps
-
-AT_LEAST = 10
-"""Steps from one evaluation to the next in a short run. Training closes a hole in some ten steps however long the run
-is; evaluations that follow each other sooner judge by the same evidence, and dig before the hole is closed."""
 
 FLOATS = 0.4
 """A Gaussian floats where its trusted light, times how deep in free space it stands, is more than this share of it."""
@@ -68,10 +64,8 @@ class PruneConfig(HookConfig):
     @classmethod
     def for_iterations(cls, iterations: int) -> PruneConfig:
         """Pruning from a fifth to two thirds of the run, then of what floats up to the last twentieth. Runs of less
-        than about a hundred iterations are too short to gather evidence in, and nothing is pruned there."""
-        every = max(AT_LEAST, steps_between_evaluations(iterations))
-        score_stop, stop = 2 * iterations // 3, 19 * iterations // 20
-        return cls(start=iterations // 5, stop=stop, score_stop=score_stop, every=every)
+        than about five hundred iterations are too short to gather evidence in: there only what no camera sees goes."""
+        return cls(start=iterations // 5, stop=19 * iterations // 20, score_stop=2 * iterations // 3)
 
 
 def depth_inconsistency(error: Tensor, weight: Tensor, tau_u: float) -> Tensor:

@@ -30,6 +30,11 @@ class Camera:
         """Camera centre in the world, [3]."""
         return -self.T_camera_world[:3, :3].T @ self.T_camera_world[:3, 3]
 
+    def world(self, pixels: np.ndarray, depth: np.ndarray) -> np.ndarray:
+        """World points [..., 3] of pixels [..., 2] at planar depths [...]."""
+        rays = np.concatenate([pixels, np.ones_like(pixels[..., :1])], -1) @ np.linalg.inv(self.K).T
+        return (rays * depth[..., None] - self.T_camera_world[:3, 3]) @ self.T_camera_world[:3, :3]
+
     def calibration(self) -> dict[str, Any]:
         """Size, K and pose as plain values, by which a prior store knows its recording again."""
         K, pose = (np.asarray(matrix, float).tolist() for matrix in (self.K, self.T_camera_world))

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from d2_plugin.priors.geometry import projected, relative_pose, scaled_camera, view_pair, viewing_rays
+from d2_plugin.priors.geometry import projected, relative_pose, seen_by
 from d2_plugin.priors.stereo.filtering.filter import texture_mask
 from d2_plugin.priors.stereo.geometric_depth import gray
 from d2_plugin.priors.stereo.settings import StereoSettings
@@ -69,7 +69,8 @@ def measure_overlap(
     shares, angles = [], []
     for index, (camera, values) in enumerate(zip(cameras, depths, strict=True)):
         others = [other for place, other in enumerate(cameras) if place != index]
-        shared = [_shared(camera, other, anywhere if values is None else values, settings) for other in others]
+        looks = [seen_by(camera, other, GRID, anywhere if values is None else values) for other in others]
+        shared = [(it & (settings.min_angle < angle) & (angle < settings.max_angle), angle) for it, angle in looks]
         # [D, pixels] of each other camera; where no depth is known, whether there is one at which it sees the pixel.
         seen = [alike if known else np.any(alike, axis=0, keepdims=True) for alike, _ in shared]
         shares.append(float(np.mean(np.any(np.stack(seen), axis=0))))
@@ -111,20 +112,3 @@ def _depths(
         return None
     near, far = depth_range or declared[0]
     return 1 / np.linspace(1 / near, 1 / far, KNOWN_DEPTHS)
-
-
-def _shared(
-    reference: Camera, source: Camera, depths: np.ndarray, settings: StereoSettings
-) -> tuple[np.ndarray, np.ndarray]:
-    """(whether `source` sees it at an angle that can be matched, that angle in degrees), both [D, pixels]."""
-    grid = scaled_camera(reference, *GRID)
-    pair = view_pair(grid, source)
-    u, v = np.meshgrid(np.arange(float(GRID[0])), np.arange(float(GRID[1])))
-    at = pair.project(u.reshape(1, -1), v.reshape(1, -1), depths[:, None])
-    inside = (at.z > 0) & (at.x > -0.5) & (at.y > -0.5) & (at.x < source.width - 0.5) & (at.y < source.height - 0.5)
-    points = viewing_rays(grid, np.float64).reshape(1, -1, 3) * depths[:, None, None]
-    away = points - pair.direction
-    # atan2 of (|a x b|, a.b) keeps its digits at small angles, where arccos has few.
-    sine = np.linalg.norm(np.cross(points, away), axis=-1)
-    angle = np.rad2deg(np.arctan2(sine, (points * away).sum(axis=-1)))
-    return inside & (angle > settings.min_angle) & (angle < settings.max_angle), angle

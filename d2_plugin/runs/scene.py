@@ -17,7 +17,7 @@ from d2_plugin.recordings.checks.memory import check_memory
 from d2_plugin.runs.metrics import GAUSSIAN_WINDOW
 from d2_plugin.runs.plan import ScenePlan, appearance_decision, plan_scene
 from d2_plugin.runs.settings import RunSettings, hooks_in_use, prior_settings, training_settings
-from d2_plugin.runs.start import TimedPoints, TrainingFrames, begin_with_exposures, initial_points, scene_extent
+from d2_plugin.runs.start import TimedPoints, TrainingFrames, initial_points, scene_extent
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +111,10 @@ class Scene:
             temporal=self.plan.uses("temporal"),
             settings=needed | dict(settings.overrides.get("backbone", {})),
         )
-        begin_with_exposures(model, recording, cameras, self.test_cameras)
+        # A model that learns exposures begins with those that the import of the videos measured.
+        gains = {name: one.gain for name, one in recording.exposures.items() if name in (*cameras, *self.test_cameras)}
+        if gains and (begin := getattr(getattr(model, "appearance", None), "start_from", None)):
+            begin(gains, cameras)
         images = TrainingFrames(recording, cameras, settings.device, settings.background_weight)
         return backbone.Trainer(model, images, training_settings(settings, backbone), attach)
 

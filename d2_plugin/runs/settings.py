@@ -169,14 +169,15 @@ def hooks_in_use(settings: RunSettings) -> tuple[str, ...]:
     return tuple(name for name in settings.hooks if name not in out)
 
 
-def hook_config(settings: RunSettings, priors: Path) -> D2Config:
-    """The hooks of a run with schedules that fit its length, and the user's tables over the defaults."""
+def hook_config(settings: RunSettings, priors: Path, trials: Mapping[str, Any] | None = None) -> D2Config:
+    """The hooks of a run with schedules that fit its length, what trials showed, and the user's tables over these."""
     hooks = hooks_in_use(settings)
     d2 = settings.overrides.get("d2", {})
     for name in d2 if isinstance(d2, Mapping) else ():
         if name in HOOKS:
             raise D2Error(f"d2.{name} is a table of its own: write its settings under [{name}]")
-    config = for_iterations(hooks, settings.iterations, prior=str(priors), seed=settings.seed)
+    believe = None if trials is None else trials["choice"]
+    config = for_iterations(hooks, settings.iterations, prior=str(priors), seed=settings.seed, believe=believe)
     plain = {name: value for name, value in asdict(config).items() if name not in HOOKS}
     tables = {name: _over(asdict(getattr(config, name)), settings.overrides.get(name, {}), name) for name in hooks}
     return D2Config.from_dict(_over(plain, d2, "d2") | tables)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import io
+import itertools
 import warnings
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -19,7 +19,7 @@ from d2_plugin.errors import D2Error, MissingExtra
 from d2_plugin.priors.colmap.points import triangulate_frames
 from d2_plugin.priors.geometry import projected
 from d2_plugin.priors.stereo.depth_range import FEWEST
-from d2_plugin.protocol import View
+from d2_plugin.protocol import DepthPrior, Label, View
 from d2_plugin.reading import parsing
 from d2_plugin.recordings import Recording
 from d2_plugin.recordings.recording import Camera
@@ -30,6 +30,13 @@ POINTS_FORMAT = 1
 
 MIN_POINTS = 1000
 """Fewer triangulated points than this are filled up with random ones; more random ones cost quality."""
+
+INSTANTS = 5
+"""Of the recording, evenly spread, from which starting points come."""
+
+FROM_STEREO = 12_000
+"""Points of a prior's stereo that a run starts from where hooks insert, at most: right from the first step on, and none
+as large as random ones, which take most of the time of a short run."""
 
 NEIGHBOURS = 3
 """Triangulated points of which a random one that a single camera sees takes the depth of one."""
@@ -103,14 +110,6 @@ def make_view(recording: Recording, camera: str, frame: int, device: torch.devic
 KEPT_IMAGES = 320 << 20
 """Bytes of decoded images that training keeps: four cameras of 20 frames at 1352x1014. A longer recording takes no
 more memory than that; what it re-reads is a small part of a step at its size."""
-
-
-def begin_with_exposures(model: Any, recording: Recording, training: Sequence[str], held_out: Sequence[str]) -> None:
-    """Let a model that learns exposures begin with the gains that the import of the videos measured."""
-    begin = getattr(getattr(model, "appearance", None), "start_from", None)
-    known = {name: one.gain for name, one in recording.exposures.items() if name in (*training, *held_out)}
-    if begin is not None and known:
-        begin(known, training)
 
 
 class TrainingFrames:
@@ -229,9 +228,7 @@ def _seen_alone_beside(
     nearest = np.argsort(apart, axis=1)[:, :NEIGHBOURS]
     chosen = nearest[np.arange(len(nearest)), np.arange(len(nearest)) % NEIGHBOURS]
     positions = drawn.positions.copy()
-    rotation, translation = own.T_camera_world[:3, :3], own.T_camera_world[:3, 3]
-    in_camera = positions[alone] @ rotation.T + translation
-    positions[alone] = (in_camera * (depths[seen][chosen] / in_camera[:, 2])[:, None] - translation) @ rotation
+    positions[alone] = own.world(pixels[alone], depths[seen][chosen])
     return replace(drawn, positions=positions)
 
 
@@ -241,21 +238,44 @@ def _random_points(
     calibration, frame = recording.cameras[camera], recording.frames[int(rng.integers(len(recording.frames)))]
     columns, rows = rng.integers(calibration.width, size=count), rng.integers(calibration.height, size=count)
     depth = 1 / rng.uniform(1 / extent.far, 1 / extent.near, count)
-    pixels = np.stack([columns + 0.5, rows + 0.5, np.ones(count)], -1)
-    in_camera = pixels @ np.linalg.inv(calibration.K).T * depth[:, None]
-    rotation, translation = calibration.T_camera_world[:3, :3], calibration.T_camera_world[:3, 3]
-    colors = recording.image(camera, frame)[rows, columns] / 255
     times = rng.uniform(0, max(recording.seconds(recording.frames[-1]), 1e-9), count)
-    return TimedPoints((in_camera - translation) @ rotation, colors, times)
+    return replace(_back_projected(recording, camera, frame, rows, columns, depth), times=times)
+
+
+def _back_projected(
+    recording: Recording, camera: str, frame: int, rows: np.ndarray, columns: np.ndarray, depth: np.ndarray
+) -> TimedPoints:
+    """Pixels [K] of an image at planar depths [K]."""
+    positions = recording.cameras[camera].world(np.stack([columns, rows], -1) + 0.5, depth)
+    colors = recording.image(camera, frame)[rows, columns] / 255
+    return TimedPoints(positions, colors, np.full(len(rows), recording.seconds(frame, camera)))
+
+
+def with_stereo(
+    points: TimedPoints,
+    recording: Recording,
+    cameras: Sequence[str],
+    prior: Callable[[str, int], DepthPrior | None],
+    seed: int = 0,
+) -> TimedPoints:
+    """The points, and up to `FROM_STEREO` verified pixels of the priors, as many of each view at five instants."""
+    views, rng = list(itertools.product(spread(recording.frames, INSTANTS), cameras)), np.random.default_rng(seed)
+    parts = [points]
+    for frame, camera in views:
+        if (known := prior(camera, frame)) is not None:
+            pixels = np.argwhere((known.labels == Label.VERIFIED).numpy())
+            rows, columns = rng.permutation(pixels)[: FROM_STEREO // len(views)].T
+            parts.append(_back_projected(recording, camera, frame, rows, columns, known.depth.numpy()[rows, columns]))
+    return TimedPoints.joined(parts)
 
 
 def triangulated_points(recording: Recording, cameras: Sequence[str]) -> TimedPoints:
-    """Points triangulated with the known poses at up to five frames spread over the recording.
+    """Points triangulated with the known poses at up to `INSTANTS` frames spread over the recording.
 
     There are none for a single camera, or where pycolmap is not installed; the latter gives a warning.
     """
     try:
-        triangulated = triangulate_frames(recording, cameras, spread(recording.frames, 5))
+        triangulated = triangulate_frames(recording, cameras, spread(recording.frames, INSTANTS))
     except MissingExtra as error:
         warnings.warn(f"{error}; Gaussians start from random points instead", stacklevel=2)
         return TimedPoints(np.zeros((0, 3)), np.zeros((0, 3), np.float32), np.zeros(0))

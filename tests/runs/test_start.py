@@ -1,5 +1,6 @@
 """From a recording to views, images and the points that Gaussians start from."""
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -8,8 +9,9 @@ import torch
 from prior_cases import world_points
 
 from d2_plugin.priors.geometry import projected
+from d2_plugin.protocol import DepthPrior, Label
 from d2_plugin.recordings.synthetic.room import synthetic_recording
-from d2_plugin.runs.start import TimedPoints, TrainingFrames, initial_points, scene_extent
+from d2_plugin.runs.start import FROM_STEREO, TimedPoints, TrainingFrames, initial_points, scene_extent, with_stereo
 
 CAMERAS = ("train0", "train1")
 
@@ -92,3 +94,27 @@ def test_what_one_camera_alone_sees_begins_at_the_depth_of_what_stands_around_it
         apart = np.abs(after[1][alone][:, None] / depths[inside][None] - 1)
         np.testing.assert_allclose(apart.min(1), 0, atol=1e-12)
     np.testing.assert_array_equal(begin(50, CAMERAS[:1]), begin(300, CAMERAS[:1]))  # one camera: no second opinion
+
+
+def test_a_run_that_inserts_starts_on_what_stereo_verified(recording) -> None:
+    """As many pixels of each view, on the surface, in their colours, at their instant; none that was not verified."""
+    sparse = TimedPoints(surface_points(recording, 50), np.full((50, 3), 0.5), np.zeros(50))
+    labels = torch.full((54, 96), int(Label.MONO), dtype=torch.uint8)
+    labels[:, :60] = Label.VERIFIED
+
+    def prior(camera: str, frame: int) -> DepthPrior | None:
+        return None if frame == 1 else DepthPrior(torch.from_numpy(recording.depth(camera, frame)), labels)
+
+    start = with_stereo(sparse, recording, CAMERAS, prior)
+    share = FROM_STEREO // 6  # three frames of two cameras
+    assert len(start) == 50 + 4 * share
+    assert np.array_equal(start.positions[:50], sparse.positions)
+    for part, (frame, camera) in enumerate(itertools.product((0, 2), CAMERAS)):
+        mine = slice(50 + part * share, 50 + (part + 1) * share)
+        pixels, depths, _ = projected(recording.cameras[camera], start.positions[mine])
+        columns, rows = np.round(pixels - 0.5).astype(int).T
+        np.testing.assert_allclose(depths, recording.depth(camera, frame)[rows, columns], rtol=1e-5)
+        np.testing.assert_array_equal(start.colors[mine], recording.image(camera, frame)[rows, columns] / 255)
+        assert set(start.times[mine]) == {recording.seconds(frame)}
+        assert columns.max() == 59
+        assert len({*zip(rows, columns)}) == share

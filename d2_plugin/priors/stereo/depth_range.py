@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from d2_plugin.errors import D2Error
-from d2_plugin.priors.geometry import check_depth_range, projected, same_spot, scaled_camera, view_pair, viewing_rays
+from d2_plugin.priors.geometry import check_depth_range, projected, same_spot, seen_by
 from d2_plugin.priors.stereo.settings import StereoSettings
 from d2_plugin.recordings.recording import Camera
 
@@ -71,14 +71,7 @@ def _bounds_from_baselines(cameras: Sequence[Camera], max_angle: float) -> Depth
 
 def _first_shared_depths(reference: Camera, source: Camera, far: float, max_angle: float) -> np.ndarray:
     """Depths from which on both see the same at less than `max_angle`, over a grid of pixels; empty where never."""
-    depths = np.geomspace(far * 1e-6, far, 400)[:, None]
-    grid = scaled_camera(reference, 9, 9)
-    pair = view_pair(grid, source)
-    u, v = np.meshgrid(np.arange(9.0), np.arange(9.0))
-    at = pair.project(u.reshape(1, -1), v.reshape(1, -1), depths)
-    seen = (at.z > 0) & (at.x > -0.5) & (at.y > -0.5) & (at.x < source.width - 0.5) & (at.y < source.height - 0.5)
-    points = viewing_rays(grid, np.float64).reshape(1, -1, 3) * depths[..., None]
-    away = points - pair.direction
-    cosine = (points * away).sum(-1) / (np.linalg.norm(points, axis=-1) * np.linalg.norm(away, axis=-1))
-    alike = seen & (cosine > np.cos(np.deg2rad(max_angle)))
-    return depths[alike.argmax(axis=0), 0][alike.any(axis=0)]
+    depths = np.geomspace(far * 1e-6, far, 400)
+    seen, angle = seen_by(reference, source, (9, 9), depths)
+    alike = seen & (angle < max_angle)
+    return depths[alike.argmax(axis=0)][alike.any(axis=0)]

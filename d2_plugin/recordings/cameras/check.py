@@ -122,9 +122,8 @@ def _alone(rig: Sequence[Camera]) -> Iterator[str]:
 def _shares(one: Camera, other: Camera, depths: np.ndarray) -> bool:
     """Whether anything in the image of `one`, at one of the depths, lies in that of `other`."""
     steps = (np.arange(GRID) + 0.5) / GRID
-    x, y = np.meshgrid(steps * one.width, steps * one.height)
-    rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3) @ np.linalg.inv(one.K).T
-    points = (rays * depths[:, None, None] - one.T_camera_world[:3, 3]) @ one.T_camera_world[:3, :3]
+    pixels = np.stack(np.meshgrid(steps * one.width, steps * one.height), -1)
+    points = one.world(pixels, depths[:, None, None])
     seen = (points @ other.T_camera_world[:3, :3].T + other.T_camera_world[:3, 3]) @ other.K.T
     depth = seen[..., 2:]
     inside = (seen[..., :2] >= 0) & (seen[..., :2] <= depth * (other.width, other.height)) & (depth > 0)

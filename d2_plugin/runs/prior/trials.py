@@ -44,8 +44,6 @@ LEAST_CAMERAS = 3
 """Without one of two cameras, one would train alone: that shows nothing of what two show."""
 STEPS = 200
 """Of one trial. What is inserted begins faint, and a trial that is too short sees its cost alone."""
-EVALUATIONS = 10
-"""Of the hooks in a trial, if they inserted to its end."""
 SIDE = 320
 """Pixels of the longer side of the images in a trial, at least. On fewer, errors of depth are too small to be seen."""
 INSTANTS = 4
@@ -176,8 +174,6 @@ class _Trial:
         """A model that some of the cameras trained, in too few steps to gather the evidence that pruning takes."""
         config: Any = hook_config(self.settings, Path())
         config = replace(config, believe=belief, prune=None, parallax=None)
-        if config.densify is not None:
-            config = replace(config, densify=replace(config.densify, every=STEPS // EVALUATIONS))
         adapter: Any = registry.load(registry.ADAPTERS, self.settings.backbone)
         scene = replace(self.scene, train_cameras=tuple(cameras))
         trainer = scene.trainer(

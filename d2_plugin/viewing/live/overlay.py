@@ -131,9 +131,7 @@ def _points(camera: Camera, prior: DepthPrior, by: str, stride: int) -> Cloud:
     thin = DepthPrior._make(None if map_ is None else map_[rows][:, columns] for map_ in prior)
     depth = thin.depth.numpy()
     shown = (depth > 0) & (thin.labels != Label.FAR).numpy()
-    y, x = np.meshgrid(rows.numpy() + 0.5, columns.numpy() + 0.5, indexing="ij")
-    rays = np.stack([x, y, np.ones_like(x)], -1)[shown] @ np.linalg.inv(camera.K).T
-    R, t = camera.T_camera_world[:3, :3], camera.T_camera_world[:3, 3]
+    pixels = np.stack(np.meshgrid(columns.numpy() + 0.5, rows.numpy() + 0.5), -1)
     if by == "image":
         grey = torch.full((*depth.shape, 3), 160, dtype=torch.uint8)
         colors = (grey if thin.colors is None else thin.colors).numpy()
@@ -142,4 +140,4 @@ def _points(camera: Camera, prior: DepthPrior, by: str, stride: int) -> Cloud:
     else:  # grey where no deviation is declared
         sigma = np.full(depth.shape, np.inf, np.float32) if thin.sigma is None else thin.sigma.numpy()
         colors = sigma_colors(sigma, depth)
-    return Cloud(((rays * depth[shown][:, None] - t) @ R).astype(np.float32), colors[shown])
+    return Cloud(camera.world(pixels[shown], depth[shown]).astype(np.float32), colors[shown])
