@@ -31,12 +31,9 @@ POINTS_FORMAT = 1
 MIN_POINTS = 1000
 """Fewer triangulated points than this are filled up with random ones; more random ones cost quality."""
 
-INSTANTS = 5
-"""Of the recording, evenly spread, from which starting points come."""
-
-FROM_STEREO = 12_000
-"""Points of a prior's stereo that a run starts from where hooks insert, at most: right from the first step on, and none
-as large as random ones, which take most of the time of a short run."""
+FROM_STEREO, SHORT = 12_000, 500
+"""Points of a prior's stereo, at most, from which a run of fewer steps starts where hooks insert: right from the first
+step on, and none as large as random ones, which take most of the time. A longer run becomes no better, but larger."""
 
 NEIGHBOURS = 3
 """Triangulated points of which a random one that a single camera sees takes the depth of one."""
@@ -259,7 +256,7 @@ def with_stereo(
     seed: int = 0,
 ) -> TimedPoints:
     """The points, and up to `FROM_STEREO` verified pixels of the priors, as many of each view at five instants."""
-    views, rng = list(itertools.product(spread(recording.frames, INSTANTS), cameras)), np.random.default_rng(seed)
+    views, rng = list(itertools.product(spread(recording.frames, 5), cameras)), np.random.default_rng(seed)
     parts = [points]
     for frame, camera in views:
         if (known := prior(camera, frame)) is not None:
@@ -270,12 +267,12 @@ def with_stereo(
 
 
 def triangulated_points(recording: Recording, cameras: Sequence[str]) -> TimedPoints:
-    """Points triangulated with the known poses at up to `INSTANTS` frames spread over the recording.
+    """Points triangulated with the known poses at up to five frames spread over the recording.
 
     There are none for a single camera, or where pycolmap is not installed; the latter gives a warning.
     """
     try:
-        triangulated = triangulate_frames(recording, cameras, spread(recording.frames, INSTANTS))
+        triangulated = triangulate_frames(recording, cameras, spread(recording.frames, 5))
     except MissingExtra as error:
         warnings.warn(f"{error}; Gaussians start from random points instead", stacklevel=2)
         return TimedPoints(np.zeros((0, 3)), np.zeros((0, 3), np.float32), np.zeros(0))
