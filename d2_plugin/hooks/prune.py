@@ -64,8 +64,9 @@ class PruneConfig(HookConfig):
     @classmethod
     def for_iterations(cls, iterations: int) -> PruneConfig:
         """Pruning from a fifth to two thirds of the run, then of what floats up to the last twentieth. Runs of less
-        than about five hundred iterations are too short to gather evidence in: there only what no camera sees goes."""
-        return cls(start=iterations // 5, stop=19 * iterations // 20, score_stop=2 * iterations // 3)
+        than about 250 iterations are too short to gather evidence in: there only what no camera sees goes."""
+        every, score_stop, stop = max(40, min(100, iterations // 20)), 2 * iterations // 3, 19 * iterations // 20
+        return cls(start=iterations // 5, stop=stop, score_stop=score_stop, every=every)
 
 
 def depth_inconsistency(error: Tensor, weight: Tensor, tau_u: float) -> Tensor:
