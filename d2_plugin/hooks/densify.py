@@ -80,7 +80,7 @@ class DensifyConfig(HookConfig):
     @classmethod
     def for_iterations(cls, iterations: int) -> DensifyConfig:
         """Insertion from the first fortieth to half of the run, in numbers that the run has time to train."""
-        every = max(5, min(iterations // 10, max(40, iterations // 20), 100))  # each time costs as much as several steps
+        every = max(5, min(iterations // 10, max(40, iterations // 20), 100))  # each costs as much as several steps
         start = max(1, min(every, iterations // 40))
         budget = max(10 * iterations, 200 * every)
         return cls(start=start, stop=max(iterations // 2, every + 1), every=every, budget_per_view=budget)
