@@ -212,6 +212,24 @@ def test_a_run_that_is_scored_again_still_says_what_was_tried(settings, tmp_path
     assert D2Config.from_toml(tmp_path / "run" / "d2.toml").believe == "stereo"
 
 
+@pytest.mark.parametrize(
+    ("changes", "starts"),
+    [
+        ({"iterations": 499}, True),
+        ({"iterations": 500}, False),
+        ({"iterations": 10, "hooks": ("prune",)}, False),
+        ({"iterations": 10, "overrides": {"d2": {"believe": "nothing"}}}, False),
+    ],
+    ids=str,
+)
+def test_a_short_run_that_inserts_starts_on_stereo(settings, tmp_path, tried, monkeypatch, changes, starts) -> None:
+    asked: list[object] = []
+    monkeypatch.setattr("d2_plugin.runs.run.with_stereo", lambda points, *_: asked.append(points) or points)
+    run = run_of(replace(settings, **changes), tmp_path / "run")
+    run._trainer(run.prepare())
+    assert bool(asked) is starts
+
+
 RECORDINGS = [
     ("dome", ("03", "07", "12", "15"), (10, 20, 30), NETWORK, "stereo"),
     ("studio", ("00", "02", "05", "07"), (5, 10, 15), None, "all"),
