@@ -52,9 +52,10 @@ def test_a_held_out_camera_plays_the_whole_recording_as_the_rasterizer_draws_it(
     found = video_of(tmp_path / "a.mp4")
     assert len(found) == 4
     assert found[0].shape == (54, 96, 3)
-    assert psnr(found[0] / 255, rendered("test0", 0)) >= 35
-    assert psnr(found[-1] / 255, rendered("test0", 3)) >= 35
-    assert psnr(found[0] / 255, rendered("train0", 0)) < 30, "another camera is another image"
+    grey = [frame.mean(-1) / 255 for frame in found]  # a video keeps colours at half the size
+    assert psnr(grey[0], rendered("test0", 0).mean(-1)) >= 35
+    assert psnr(grey[-1], rendered("test0", 3).mean(-1)) >= 35
+    assert psnr(grey[0], rendered("train0", 0).mean(-1)) < 30, "another camera is another image"
 
 
 def test_an_orbit_has_the_asked_length_rate_and_odd_size(trained: Path, tmp_path: Path) -> None:
