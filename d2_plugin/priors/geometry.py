@@ -114,15 +114,14 @@ def seen_by(reference: Camera, source: Camera, grid: tuple[int, int], depths: np
     """Of a grid of the reference's pixels (across, down) at depths [D]: whether the source sees them, and the angle in
     degrees between both rays, [D, pixels]."""
     small = scaled_camera(reference, *grid)
-    pair, maps = view_pair(small, source), [np.full(grid[::-1], depth) for depth in depths]
-    at = pair.project(*pixel_grid(small, np.float64), np.stack(maps))
+    pair, maps = view_pair(small, source), np.broadcast_to(depths[:, None, None], (len(depths), *grid[::-1]))
+    at = pair.project(*pixel_grid(small, np.float64), maps)
     inside = (at.z > 0) & (at.x > -0.5) & (at.y > -0.5) & (at.x < source.width - 0.5) & (at.y < source.height - 0.5)
-    angles = [triangulation_angle(small, pair, map_) for map_ in maps]
-    return inside.reshape(len(depths), -1), np.rad2deg(angles).reshape(len(depths), -1)
+    return inside.reshape(len(depths), -1), np.rad2deg(triangulation_angle(small, pair, maps)).reshape(len(depths), -1)
 
 
 def triangulation_angle(camera: Camera, pair: ViewPair, depth: np.ndarray) -> np.ndarray:
-    """Angle [H, W] in radians between the rays of both cameras at each pixel's 3D point; 0 for one centre."""
+    """Angle [..., H, W] in radians between the rays of both cameras at each pixel's 3D point; 0 for one centre."""
     unit = 2.0 ** -np.frexp(np.median(depth))[1]  # near 1 no square overflows, and a power of two changes no digit
     points = viewing_rays(camera) * (depth * np.float32(unit))[..., None]
     other = points - (pair.direction * unit).astype(np.float32)
