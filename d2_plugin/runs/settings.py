@@ -30,8 +30,8 @@ from d2_plugin.values import shown
 
 HOOK_NAMES = ("prior", *HOOKS)
 """What `--hooks` may name; "prior" alone builds the depth prior and trains without it."""
-BETWEEN = ("motion", "parallax")
-"""Hooks that supervise between what was recorded; a third of the time of a step."""
+WORTH_FROM = {"motion": 200, "parallax": 500}
+"""Steps from which hooks that look between what was recorded are worth their time; a shorter run makes more steps."""
 TABLES = ("backbone", "training", "d2", *HOOKS, "priors", "plan")
 """What a configuration file may hold."""
 
@@ -164,9 +164,9 @@ def prior_settings(settings: RunSettings) -> PriorSettings:
 
 
 def hooks_in_use(settings: RunSettings) -> tuple[str, ...]:
-    """Names of the run's hooks. A short run leaves `BETWEEN` out, unless they have a table: more steps gain more."""
-    out = {"prior"} if settings.iterations >= 200 else {"prior", *BETWEEN} - {*settings.overrides}
-    return tuple(name for name in settings.hooks if name not in out)
+    """Names of the run's hooks: of `WORTH_FROM`, those that are worth it here or have a table."""
+    early = {name for name, steps in WORTH_FROM.items() if settings.iterations < steps} - {*settings.overrides}
+    return tuple(name for name in settings.hooks if name not in {"prior", *early})
 
 
 def hook_config(settings: RunSettings, priors: Path, trials: Mapping[str, Any] | None = None) -> D2Config:

@@ -62,16 +62,20 @@ def test_depth_is_emulated_where_no_network_takes_the_place_of_emulated_maps(mov
 
 
 @pytest.mark.parametrize(
-    ("iterations", "tables", "built"), [(199, {}, False), (200, {}, True), (199, {"motion": {}}, True)]
+    ("iterations", "tables", "built"),
+    [(199, {}, False), (200, {}, True), (499, {}, True), (500, {}, True), (199, {"motion": {}}, True)],
 )
-def test_long_runs_and_users_who_say_so_get_flow(moving, tmp_path, monkeypatch, iterations, tables, built) -> None:
+def test_long_runs_and_users_who_say_so_get_what_lies_between(
+    moving, tmp_path, monkeypatch, iterations, tables, built
+) -> None:
     def stop(*_: object, between: bool) -> None:
         raise D2Error(f"between: {between}")
 
     monkeypatch.setattr("d2_plugin.runs.run.build_priors_for", stop)
     room = save_recording(moving, tmp_path / "room")
     run = Run(RunSettings(str(room), PAIR, iterations=iterations, overrides=tables), tmp_path / "run")
-    assert any("[motion] brings it back" in note for note in run.scene.recording.notes) == (not built)
+    for name, left_out in (("motion", not built), ("parallax", iterations < 500)):
+        assert any(f"[{name}] brings it back" in note for note in run.scene.recording.notes) == left_out
     refuses(f"between: {built}", run.prepare)
 
 

@@ -169,7 +169,7 @@ def test_the_user_may_choose_and_then_nothing_is_tried(settings, tmp_path, tried
     ],
 )
 def test_other_depth_fills_the_gaps_without_parallax(settings, tmp_path, monkeypatch, choice, tables, on) -> None:
-    run = run_of(replace(settings, overrides=tables), tmp_path / "run")
+    run = run_of(replace(settings, iterations=500, overrides=tables), tmp_path / "run")
     run.trials = {"choice": choice}
     monkeypatch.setattr("d2_plugin.runs.run.D2Hooks", lambda config, *_, **__: config)
     config = run._attach(make_model())
