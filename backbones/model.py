@@ -23,9 +23,12 @@ from .densify import DensifySettings, densify
 from .gaussians import Gaussians
 from .starting import nearest_neighbour_scales
 
-STATISTICS = ("screen_gradient", "seen")
-"""Per Gaussian: summed length of the screen-space gradient, and the number of views that had one."""
+STATISTICS = ("screen_gradient", "seen", "held")
+"""Per Gaussian: summed length of the screen-space gradient, the number of views that had one, and the share that its
+position leaves out of each step."""
 
+HELD = 0.7
+"""That share of what hooks insert: a depth prior knows its place better than random points know theirs."""
 INITIAL_OPACITY = 0.1
 """Opacity of the Gaussians at the start."""
 LAST_POSITION_RATE = 0.01
@@ -54,7 +57,7 @@ class SplatSettings(Settings):
     """False leaves time out: these are ordinary 3D Gaussians."""
     sh_degree: Annotated[int, Range(0, 3)] = 0
     """Degree of the view-dependent colour."""
-    position_rate: Annotated[float, Range(1e-9, 100)] = 3e-4
+    position_rate: Annotated[float, Range(1e-9, 100)] = 1e-3
     """Learning rate of positions at the first step, times the extent of the scene."""
     scale_rate: LearningRate = 2e-2
     """Learning rate of log-scales."""
@@ -257,7 +260,10 @@ class SplatModel(ABC):
 
     def optimize(self, step: int, iterations: int) -> None:
         """One optimizer step, gradients cleared, learning rates for the next step set."""
+        positions = self.gaussians["positions"].detach()
+        before = positions.clone()
         self.gaussians.optimizer.step()
+        positions.lerp_(before, self.gaussians.statistics["held"][:, None])
         self.gaussians.optimizer.zero_grad(set_to_none=True)
         share = settled(step, iterations)
         if self.background is not None:
@@ -273,6 +279,12 @@ class SplatModel(ABC):
     def densify(self, step: int, iterations: int, generator: torch.Generator) -> None:
         """The backbone's own clone, split and prune where `settings.densify` schedules them."""
         densify(self, self.settings.densify, step, iterations, generator)
+
+    def insert(self, points: Points) -> None:
+        """Add isotropic Gaussians at points whose place is known: they leave it slowly."""
+        before = len(self)
+        self.append(self.initial_rows(points, self.settings, self.duration))
+        self.gaussians.statistics["held"][before:] = HELD
 
     def append(self, rows: Mapping[str, Tensor]) -> None:
         """Add Gaussians (raw rows by name, [K, ...]) at the end. All growth goes through here."""
@@ -350,6 +362,9 @@ class SplatModel(ABC):
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from `state_dict()`; the state says whether there is a background and an appearance."""
         self.gaussians.load_state_dict(state)
+        self.gaussians.statistics.setdefault(
+            "held", self.gaussians["opacity_logits"].new_zeros(len(self))
+        )  # was absent
         self.background = Background(self.gaussians.device) if "background" in state else None
         if self.background is not None:
             self.background.load_state_dict(state["background"])
