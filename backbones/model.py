@@ -362,9 +362,8 @@ class SplatModel(ABC):
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from `state_dict()`; the state says whether there is a background and an appearance."""
         self.gaussians.load_state_dict(state)
-        self.gaussians.statistics.setdefault(
-            "held", self.gaussians["opacity_logits"].new_zeros(len(self))
-        )  # was absent
+        statistics = self.gaussians.statistics
+        statistics.setdefault("held", torch.zeros_like(statistics["seen"]))  # versions before saved none
         self.background = Background(self.gaussians.device) if "background" in state else None
         if self.background is not None:
             self.background.load_state_dict(state["background"])

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from tiny import ALL_HOOKS, BACKBONES, bend_field, make_adapter, make_model, make_trainer, make_views, parameters, same
 
 from d2_plugin import D2Config, D2Error, D2Hooks
-from d2_plugin.backbones.densify import DensifySettings, grow, prune
+from d2_plugin.backbones.densify import DensifySettings, densify, grow, prune
 from d2_plugin.backbones.model import HELD, STATISTICS, SplatModel
 from d2_plugin.backbones.starting import nearest_neighbour_scales
 from d2_plugin.backbones.yang4d import create
@@ -104,11 +104,11 @@ def test_every_per_gaussian_state_stays_on_its_row(name: str, sequence: list[tup
 
 
 def test_what_hooks_insert_leaves_its_place_slowly(backbone: str) -> None:
-    """Each step of its position is shorter; growth and pruning of others do not change that, nor does saving."""
+    """Each step of its position is shorter, after growth and pruning and in a saved model as well."""
     model = make_model(COUNT, backbone=backbone)
     make_adapter(model).insert(some_points(3))
     model.append(model.initial_rows(some_points(1), model.settings, model.duration))
-    model.densify(10, 100, generator(0))
+    densify(model, DensifySettings(), 100, 1000, generator(0))
     again = make_model(COUNT, backbone=backbone)
     again.load_state_dict(model.state_dict())
     for own in (model, again):
