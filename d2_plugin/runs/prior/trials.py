@@ -13,7 +13,6 @@ for both beliefs alike.
 from __future__ import annotations
 
 import contextlib
-import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -30,7 +29,7 @@ from d2_plugin.durable import CannotWrite, write_table
 from d2_plugin.hooks.prior import Belief, Store
 from d2_plugin.plugin import D2Hooks
 from d2_plugin.progress import progress_bar
-from d2_plugin.protocol import DepthPrior, Label
+from d2_plugin.protocol import DepthPrior
 from d2_plugin.recordings import open_recording
 from d2_plugin.runs.metrics import ssim_uniform
 from d2_plugin.runs.scene import Scene
@@ -50,11 +49,8 @@ INSTANTS = 4
 """Of the recording in a trial, evenly spread."""
 MOST_LEFT_OUT = 2
 """Cameras that are left out, spread evenly in the order in which they are named."""
-CLEAR = 0.01
+CLEAR = 0.02
 """A difference of SSIM at one left-out camera that needs no second one."""
-TIE, EXACT = 0.005, 0.06
-"""Where stereo alone is better by less than the first, images decide nothing, and the whole prior is used if half of
-what the network alone knows declares an error below the second: it has depth where nothing can be matched."""
 
 
 @dataclass(frozen=True)
@@ -65,20 +61,17 @@ class Trials:
     """SSIM of the images of each left-out camera, where the others were trained with the whole prior."""
     stereo: Mapping[str, float]
     """The same with stereo alone."""
-    declared: float
-    """Median sigma of the depths that the network alone knows."""
     cpu_seconds: float
 
     @property
     def choice(self) -> Belief:
-        """What predicts left-out cameras better, or as well with more depth."""
-        behind = _mean(self.stereo) - _mean(self.everything)
-        return "all" if behind < (TIE if self.declared < EXACT else 0) else "stereo"
+        """What predicts left-out cameras better."""
+        return "all" if _mean(self.everything) > _mean(self.stereo) else "stereo"
 
     def __str__(self) -> str:
         with_it, without = _mean(self.everything), _mean(self.stereo)
-        why = "is worth inserting" if with_it > without else "has more surfaces for images as good"
-        verdict = f"{why}: the whole prior is used" if self.choice == "all" else "confirms stereo, which alone is used"
+        used = {"all": "is worth inserting: the whole prior is used", "stereo": "confirms stereo, which alone is used"}
+        verdict = used[self.choice]
         return f"here monocular depth {verdict} (left-out cameras: SSIM {with_it:.3f} with it, {without:.3f} without)"
 
     def as_dict(self) -> dict[str, Any]:
@@ -135,7 +128,7 @@ def leave_out_in_turn(settings: RunSettings, scene: Scene, points: TimedPoints, 
                 bar.update(sum(map(len, scores.values())), f"without camera {camera}: SSIM {ssim:.3f}")
             if abs(scores["all"][camera] - scores["stereo"][camera]) >= CLEAR:
                 break
-    return Trials(scores["all"], scores["stereo"], trial.declared(), time.process_time() - begin)
+    return Trials(scores["all"], scores["stereo"], time.process_time() - begin)
 
 
 def left_out(cameras: Sequence[str]) -> tuple[str, ...]:
@@ -181,12 +174,6 @@ class _Trial:
         )
         trainer.run()
         return trainer.model
-
-    def declared(self) -> float:
-        """Median sigma of what the network alone knows at the instants of the trial; NaN where that is nothing."""
-        priors = [self.store.prior(c, f) for c in self.scene.train_cameras for f in self.scene.recording.frames]
-        alone = [p.sigma[p.labels == Label.MONO] for p in priors if p is not None and p.sigma is not None]
-        return float(torch.cat(alone).median()) if alone else math.nan
 
     @torch.no_grad()
     def score(self, model: Any, camera: str) -> float:
