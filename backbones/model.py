@@ -63,6 +63,9 @@ class SplatSettings(Settings):
     """Learning rate of log-scales."""
     opacity_rate: LearningRate = 5e-2
     """Learning rate of opacity logits."""
+    jitter: Annotated[float, Range(0, 10)] = 0.2
+    """How far aside each Gaussian stands in a training render, at random, in its own standard deviations: with few
+    cameras Gaussians otherwise rely on one another's exact places. 0 leaves them where they are."""
     background: bool = True
     """Whether directions have a colour of their own at infinity, behind all Gaussians: for skies, and for what no
     training camera has seen, which is black without it."""
@@ -207,15 +210,18 @@ class SplatModel(ABC):
         """The Gaussians as straight lines that fade in time, exactly; None where the model is not of that form."""
         return None
 
-    def render(self, view: View, background: Tensor | None = None) -> Render:
+    def render(self, view: View, background: Tensor | None = None, generator: torch.Generator | None = None) -> Render:
         """Colour, depth sum and alpha of one view, differentiable; remembers what `accumulate` needs afterwards.
 
         The colour is as the view's camera saw it where it trained and exposures are learnt.
 
-        A given `background` colour takes the place of the model's own background.
+        A given `background` colour takes the place of the model's own background. With a `generator` of the CPU, for a
+        training step, Gaussians stand aside as `settings.jitter` says.
         """
         splats = self.slice_at(view)
         colors = self.colors_seen(view, splats)
+        if generator is not None and self.settings.jitter:
+            splats = aside(splats, self.settings.jitter, generator)
         self._drawn = splats.rows
         self.screen_offsets = splats.means.new_zeros(len(colors), 2, requires_grad=torch.is_grad_enabled())
         if background is not None:
@@ -370,6 +376,32 @@ class SplatModel(ABC):
         self.appearance = Appearance(self.gaussians.device) if "appearance" in state else None
         if self.appearance is not None:
             self.appearance.load_state_dict(state["appearance"])
+
+
+def aside(splats: Splats, spread: float, generator: torch.Generator) -> Splats:
+    """Each Gaussian with its mean at a draw from itself, `spread` times as wide; the draw has no gradient.
+
+    L v for a standard normal v, where L L^T is the covariance (Cholesky). A covariance that rounding left indefinite,
+    as that of a very thin Gaussian, gives a draw within its extent along each axis of the world.
+    """
+    with torch.no_grad():
+        xx, xy, xz, yy, yz, zz = splats.covariances.unbind(-1)
+        if xx.is_cuda:  # drawn there, without a wait
+            generator = torch.Generator(xx.device).manual_seed(int(torch.randint(1 << 62, (), generator=generator)))
+        x, y, z = torch.randn(3, len(xx), generator=generator, dtype=xx.dtype, device=xx.device)
+        a = xx.clamp(min=torch.finfo(xx.dtype).tiny).sqrt()
+        b, c = _within(xy / a, yy), _within(xz / a, zz)
+        rest = (yy - b * b).clamp(min=torch.finfo(xx.dtype).tiny), (zz - c * c).clamp(min=0)
+        d = rest[0].sqrt()
+        e = _within((yz - b * c) / d, rest[1])
+        f = (rest[1] - e * e).clamp(min=0).sqrt()
+        offsets = torch.stack([a * x, b * x + d * y, c * x + e * y + f * z], -1)
+    return splats._replace(means=splats.means + spread * offsets)
+
+
+def _within(values: Tensor, squares: Tensor) -> Tensor:
+    limits = squares.clamp(min=0).sqrt()
+    return values.clamp(-limits, limits)
 
 
 def learning_rates(settings: SplatSettings, extent: float, duration: float) -> dict[str, float]:

@@ -26,7 +26,9 @@ class Model(Protocol):
     """What the loop needs of a backbone."""
 
     def start_from(self, views: Sequence[View], images: Callable[[int], Tensor]) -> None: ...
-    def render(self, view: View, background: Tensor | None = None) -> Render: ...
+    def render(
+        self, view: View, background: Tensor | None = None, generator: torch.Generator | None = None
+    ) -> Render: ...
     def regularization(self) -> Tensor | float: ...
     def accumulate(self, view: View) -> None: ...
     def optimize(self, step: int, iterations: int) -> None: ...
@@ -102,7 +104,7 @@ class Trainer:
             self.step += 1
             index = self._next_view()
             view = self.frames.views[index]
-            render = model.render(view)
+            render = model.render(view, generator=self._generator)
             loss = photometric_loss(render.color, self._image(index), self.settings.ssim_weight, self._weights(index))
             logged = loss.item()
             regularization = model.regularization()
