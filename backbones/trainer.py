@@ -21,6 +21,9 @@ DISPENSED = 0.7
 PASSES = 8
 """Steps for each training view from which on that is done: it takes a look or two at each."""
 
+UNSTEADY = 1000
+"""Steps of a run from which on Gaussians stand aside at random: a shorter one has still to find their places."""
+
 
 class Model(Protocol):
     """What the loop needs of a backbone."""
@@ -100,11 +103,12 @@ class Trainer:
     def run(self, until: int | None = None, on_step: Callable[[int, float], None] | None = None) -> None:
         """Train up to and including step `until` (default: all); `on_step(step, loss)` reports each one."""
         model, iterations, d2 = self.model, self.settings.iterations, self.d2
+        generator = self._generator if iterations >= UNSTEADY else None
         while self.step < (iterations if until is None else until):
             self.step += 1
             index = self._next_view()
             view = self.frames.views[index]
-            render = model.render(view, generator=self._generator)
+            render = model.render(view, generator=generator)
             loss = photometric_loss(render.color, self._image(index), self.settings.ssim_weight, self._weights(index))
             logged = loss.item()
             regularization = model.regularization()
