@@ -21,6 +21,7 @@ from .appearance import Appearance, changed
 from .background import Background
 from .densify import DensifySettings, densify
 from .gaussians import Gaussians
+from .jitter import aside
 from .starting import nearest_neighbour_scales
 
 STATISTICS = ("screen_gradient", "seen", "held")
@@ -376,32 +377,6 @@ class SplatModel(ABC):
         self.appearance = Appearance(self.gaussians.device) if "appearance" in state else None
         if self.appearance is not None:
             self.appearance.load_state_dict(state["appearance"])
-
-
-def aside(splats: Splats, spread: float, generator: torch.Generator) -> Splats:
-    """Each Gaussian with its mean at a draw from itself, `spread` times as wide; the draw has no gradient.
-
-    L v for a standard normal v, where L L^T is the covariance (Cholesky). A covariance that rounding left indefinite,
-    as that of a very thin Gaussian, gives a draw within its extent along each axis of the world.
-    """
-    with torch.no_grad():
-        xx, xy, xz, yy, yz, zz = splats.covariances.unbind(-1)
-        if xx.is_cuda:  # drawn there, without a wait
-            generator = torch.Generator(xx.device).manual_seed(int(torch.randint(1 << 62, (), generator=generator)))
-        x, y, z = torch.randn(3, len(xx), generator=generator, dtype=xx.dtype, device=xx.device)
-        a = xx.clamp(min=torch.finfo(xx.dtype).tiny).sqrt()
-        b, c = _within(xy / a, yy), _within(xz / a, zz)
-        rest = (yy - b * b).clamp(min=torch.finfo(xx.dtype).tiny), (zz - c * c).clamp(min=0)
-        d = rest[0].sqrt()
-        e = _within((yz - b * c) / d, rest[1])
-        f = (rest[1] - e * e).clamp(min=0).sqrt()
-        offsets = torch.stack([a * x, b * x + d * y, c * x + e * y + f * z], -1)
-    return splats._replace(means=splats.means + spread * offsets)
-
-
-def _within(values: Tensor, squares: Tensor) -> Tensor:
-    limits = squares.clamp(min=0).sqrt()
-    return values.clamp(-limits, limits)
 
 
 def learning_rates(settings: SplatSettings, extent: float, duration: float) -> dict[str, float]:
