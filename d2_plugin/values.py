@@ -151,8 +151,9 @@ def _as_number(kind: type, limits: Range, value: Any, name: str) -> int | float:
     except OverflowError:
         raise OutOfRange(str(_wrong(name, "must be a number below 1.8e308 in size", value))) from None
     if not limits.holds(number):
-        unit = f" {limits.unit}" if limits.unit else ""
-        raise OutOfRange(str(_wrong(name, f"must be {limits.described(number)}{unit}", value)))
+        bounds = limits.described(number)
+        unit = limits.unit.removesuffix("s") if bounds.endswith(" 1") else limits.unit
+        raise OutOfRange(str(_wrong(name, f"must be {bounds} {unit}".rstrip(), value)))
     return number
 
 

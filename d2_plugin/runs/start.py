@@ -31,7 +31,7 @@ POINTS_FORMAT = 1
 MIN_POINTS = 1000
 """Fewer triangulated points than this are filled up with random ones; more random ones cost quality."""
 
-FROM_STEREO, SHORT = 12_000, 500
+FROM_STEREO, SHORT = 12_000, 1000
 """Points of a prior's stereo, at most, from which a run of fewer steps starts where hooks insert: right from the first
 step on, and none as large as random ones, which take most of the time. A longer run becomes no better, but larger."""
 

@@ -134,7 +134,7 @@ class TestMistakes:
             (Work, ["--frames", "0-8"], "--frames is '0-8': give whole numbers joined by commas, or first:last"),
             (Work, ["--frames", "0:8:0"], "--frames is '0:8:0'"),
             (Work, ["--frames", ""], "--frames is '': give whole numbers"),
-            (Work, ["--prune.edges.width", "0"], "--prune.edges.width must be at least 1 pixels, got 0"),
+            (Work, ["--prune.edges.width", "0"], "--prune.edges.width must be at least 1 pixel, got 0"),
             (Work, ["--prune.enabled", "perhaps"], "--prune.enabled must be"),
             (Work, ["--prune.enabled"], "--prune.enabled needs a value"),
             (Work, ["second"], "d2 work has no place for 'second'"),
