@@ -30,7 +30,7 @@ from d2_plugin.values import shown
 
 HOOK_NAMES = ("prior", *HOOKS)
 """What `--hooks` may name; "prior" alone builds the depth prior and trains without it."""
-WORTH_FROM = {"motion": 200, "parallax": 1000}
+WORTH_FROM = {"motion": 200, "parallax": 500}
 """Steps from which hooks that look between what was recorded are worth their time; a shorter run makes more steps."""
 TABLES = ("backbone", "training", "d2", *HOOKS, "priors", "plan")
 """What a configuration file may hold."""

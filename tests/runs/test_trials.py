@@ -221,8 +221,8 @@ def test_a_run_that_is_scored_again_still_says_what_was_tried(settings, tmp_path
 @pytest.mark.parametrize(
     ("changes", "starts"),
     [
-        ({"iterations": 499}, True),
-        ({"iterations": 500}, False),
+        ({"iterations": 999}, True),
+        ({"iterations": 1000}, False),
         ({"iterations": 10, "hooks": ("prune",)}, False),
         ({"iterations": 10, "overrides": {"d2": {"believe": "nothing"}}}, False),
     ],
