@@ -65,8 +65,8 @@ class SplatSettings(Settings):
     opacity_rate: LearningRate = 5e-2
     """Learning rate of opacity logits."""
     jitter: Annotated[float, Range(0, 10)] = 0.2
-    """How far aside each Gaussian stands in a training render, at random, in its own standard deviations, in runs of
-    1000 steps and more: with few cameras Gaussians otherwise rely on one another's exact places. 0: not at all."""
+    """How far aside each Gaussian stands in a training step, at random (its own standard deviations), in runs of 1000
+    steps and more: with few cameras Gaussians otherwise rely on one another's exact places. 0: not at all."""
     background: bool = True
     """Whether directions have a colour of their own at infinity, behind all Gaussians: for skies, and for what no
     training camera has seen, which is black without it."""
