@@ -1,7 +1,7 @@
 """Noise on the places of Gaussians while they train: with few cameras each otherwise relies on where the others are.
 
 Gaussians that reproduce the training images only where each stands exactly show something else from aside. Chen et al.
-2025 call it co-adaptation, and put noise on opacities; noise on places loses nothing here beyond errors (docs/evidence.md).
+2025 call it co-adaptation, and put noise on opacities; noise on places loses nothing beyond errors (docs/evidence.md).
 """
 
 from __future__ import annotations
