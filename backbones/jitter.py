@@ -33,7 +33,7 @@ def offsets(covariances: Tensor, generator: torch.Generator) -> Tensor:
     return torch.stack([a * x, b * x + d * y, c * x + e * y + f * z], -1)
 
 
-def aside(splats: Splats, spread: float, generator: torch.Generator) -> Splats:
+def jittered(splats: Splats, spread: float, generator: torch.Generator) -> Splats:
     """Each Gaussian at a place drawn from itself, `spread` times as wide; gradients are those of its own place."""
     return splats._replace(means=splats.means + spread * offsets(splats.covariances, generator))
 

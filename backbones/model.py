@@ -21,7 +21,7 @@ from .appearance import Appearance, changed
 from .background import Background
 from .densify import DensifySettings, densify
 from .gaussians import Gaussians
-from .jitter import aside
+from .jitter import jittered
 from .starting import nearest_neighbour_scales
 
 STATISTICS = ("screen_gradient", "seen", "held")
@@ -222,7 +222,7 @@ class SplatModel(ABC):
         splats = self.slice_at(view)
         colors = self.colors_seen(view, splats)
         if generator is not None and self.settings.jitter:
-            splats = aside(splats, self.settings.jitter, generator)
+            splats = jittered(splats, self.settings.jitter, generator)
         self._drawn = splats.rows
         self.screen_offsets = splats.means.new_zeros(len(colors), 2, requires_grad=torch.is_grad_enabled())
         if background is not None:

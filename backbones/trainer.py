@@ -21,7 +21,7 @@ DISPENSED = 0.7
 PASSES = 8
 """Steps for each training view from which on that is done: it takes a look or two at each."""
 
-UNSTEADY = 1000
+JITTER_FROM = 1000
 """Steps of a run from which on Gaussians stand aside at random: a shorter one has still to find their places."""
 
 
@@ -103,7 +103,7 @@ class Trainer:
     def run(self, until: int | None = None, on_step: Callable[[int, float], None] | None = None) -> None:
         """Train up to and including step `until` (default: all); `on_step(step, loss)` reports each one."""
         model, iterations, d2 = self.model, self.settings.iterations, self.d2
-        generator = self._generator if iterations >= UNSTEADY else None
+        generator = self._generator if iterations >= JITTER_FROM else None
         while self.step < (iterations if until is None else until):
             self.step += 1
             index = self._next_view()

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from tiny import ALL_HOOKS, BACKBONES, bend_field, make_adapter, make_model, make_trainer, make_views, parameters, same
 
 from d2_plugin import D2Config, D2Error, D2Hooks
+from d2_plugin.backbones import trainer as training
 from d2_plugin.backbones.densify import DensifySettings, densify, grow, prune
 from d2_plugin.backbones.model import HELD, STATISTICS, SplatModel
 from d2_plugin.backbones.starting import nearest_neighbour_scales
@@ -134,8 +135,11 @@ def test_all_hooks_off_is_bitwise_the_bare_trainer(backbone: str, temporal: bool
 
 
 @pytest.mark.parametrize(("config", "count"), [(ALL_HOOKS, 2), (D2Config(), 1)])
-def test_a_resumed_run_is_bitwise_the_uninterrupted_one(backbone: str, config: D2Config, count: int, threads) -> None:
+def test_a_resumed_run_is_bitwise_the_uninterrupted_one(
+    backbone: str, config: D2Config, count: int, threads, monkeypatch: pytest.MonkeyPatch
+) -> None:
     threads(count)
+    monkeypatch.setattr(training, "JITTER_FROM", 20)
     whole, first = (make_trainer(config, 20, backbone=backbone, appearance=True) for _ in range(2))
     whole.run()
     first.run(until=12)

@@ -1,4 +1,7 @@
-"""Noise on the places of Gaussians while they train: how wide it is, also for thin ones, and which runs have it."""
+"""Noise on the places of Gaussians while they train: how wide it is, also for thin ones, and which runs have it.
+
+That a run with it is resumed bitwise is tested with everything else that a run keeps (test_both_backbones.py).
+"""
 
 import pytest
 import torch
@@ -27,7 +30,7 @@ def test_places_are_drawn_from_the_gaussian_itself() -> None:
 
 @pytest.mark.parametrize("axes", [(1e2, 1e-3, 1e-6), (1e6, 1e6, 1e-6), (1e-18, 1e-18, 1e-18), (1e15, 1.0, 1.0)])
 def test_a_draw_is_no_wider_than_the_gaussian_however_thin_that_is(axes: tuple[float, float, float]) -> None:
-    """In single precision such covariances are indefinite by rounding."""
+    """In single precision the covariances of thin ones are indefinite by rounding."""
     turned = torch.linalg.qr(torch.randn(2000, 3, 3, generator=generator(1))).Q
     covariance = packed((turned * torch.tensor(axes) ** 2) @ turned.mT)
     drawn = offsets(covariance, generator())
@@ -62,17 +65,6 @@ def test_short_runs_and_runs_without_jitter_have_none(monkeypatch: pytest.Monkey
 
     without = trained(8, jitter=0.0)
     assert same(trained(8), without)
-    monkeypatch.setattr(training, "UNSTEADY", 8)
+    monkeypatch.setattr(training, "JITTER_FROM", 8)
     assert same(trained(8, jitter=0.0), without)
     assert not same(trained(8), without)
-
-
-@pytest.mark.parametrize("name", BACKBONES)
-def test_a_run_with_jitter_is_resumed_bitwise(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(training, "UNSTEADY", 1)
-    whole, first, second = (make_trainer(D2Config(), 12, backbone=name) for _ in range(3))
-    whole.run()
-    first.run(until=7)
-    second.load_state_dict(first.state_dict())
-    second.run()
-    assert same(parameters(whole), parameters(second))
