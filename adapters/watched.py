@@ -55,7 +55,7 @@ class WatchedModel(Resizing, Observer, Generic[Model]):
 
     def insert(self, points: Points) -> int:
         """Insert isotropic Gaussians at the points, living around the time of their frame; returns their number."""
-        self.model.insert(points)
+        self.model.append(self.model.initial_rows(points, self.model.settings, self.model.duration))
         return len(points.positions)
 
     def remove(self, mask: Tensor) -> None:

@@ -63,8 +63,8 @@ def densify(model: Growable, settings: DensifySettings, step: int, iterations: i
         return
     grow(model, settings, generator)
     prune(model)
-    for name in ("screen_gradient", "seen"):
-        model.gaussians.statistics[name].zero_()
+    for value in model.gaussians.statistics.values():
+        value.zero_()
 
 
 def grow(model: Growable, settings: DensifySettings, generator: torch.Generator) -> None:

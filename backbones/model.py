@@ -24,12 +24,9 @@ from .gaussians import Gaussians
 from .jitter import jittered
 from .starting import nearest_neighbour_scales
 
-STATISTICS = ("screen_gradient", "seen", "held")
-"""Per Gaussian: summed length of the screen-space gradient, the number of views that had one, and the share that its
-position leaves out of each step."""
+STATISTICS = ("screen_gradient", "seen")
+"""Per Gaussian: summed length of the screen-space gradient, and the number of views that had one."""
 
-HELD = 0.7
-"""That share of what hooks insert: a depth prior knows its place better than random points know theirs."""
 INITIAL_OPACITY = 0.1
 """Opacity of the Gaussians at the start."""
 LAST_POSITION_RATE = 0.01
@@ -267,10 +264,7 @@ class SplatModel(ABC):
 
     def optimize(self, step: int, iterations: int) -> None:
         """One optimizer step, gradients cleared, learning rates for the next step set."""
-        positions = self.gaussians["positions"].detach()
-        before = positions.clone()
         self.gaussians.optimizer.step()
-        positions.lerp_(before, self.gaussians.statistics["held"][:, None])
         self.gaussians.optimizer.zero_grad(set_to_none=True)
         share = settled(step, iterations)
         if self.background is not None:
@@ -286,12 +280,6 @@ class SplatModel(ABC):
     def densify(self, step: int, iterations: int, generator: torch.Generator) -> None:
         """The backbone's own clone, split and prune where `settings.densify` schedules them."""
         densify(self, self.settings.densify, step, iterations, generator)
-
-    def insert(self, points: Points) -> None:
-        """Add isotropic Gaussians at points whose place is known: they leave it slowly."""
-        before = len(self)
-        self.append(self.initial_rows(points, self.settings, self.duration))
-        self.gaussians.statistics["held"][before:] = HELD
 
     def append(self, rows: Mapping[str, Tensor]) -> None:
         """Add Gaussians (raw rows by name, [K, ...]) at the end. All growth goes through here."""
@@ -369,8 +357,6 @@ class SplatModel(ABC):
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from `state_dict()`; the state says whether there is a background and an appearance."""
         self.gaussians.load_state_dict(state)
-        statistics = self.gaussians.statistics
-        statistics.setdefault("held", torch.zeros_like(statistics["seen"]))  # versions before saved none
         self.background = Background(self.gaussians.device) if "background" in state else None
         if self.background is not None:
             self.background.load_state_dict(state["background"])

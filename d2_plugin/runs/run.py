@@ -26,7 +26,7 @@ from d2_plugin.runs.rows import circumstances
 from d2_plugin.runs.scene import Guidance, Scene
 from d2_plugin.runs.settings import HOOK_NAMES, RunSettings, check, hook_config, hooks_in_use
 from d2_plugin.runs.shared import COST
-from d2_plugin.runs.start import SHORT, TimedPoints, triangulated_points, with_stereo
+from d2_plugin.runs.start import TimedPoints, triangulated_points, with_stereo
 from d2_plugin.store.store import PriorStore
 from d2_plugin.values import checked_arguments
 
@@ -186,7 +186,7 @@ class Run:
         start = triangulated
         if self.guidance is not None and attach:
             start = self.guidance.start(self.scene, triangulated, self.priors)
-        elif attach and self.settings.iterations < SHORT:
+        elif attach:
             config, scene = hook_config(self.settings, self.priors), self.scene
             if config.densify is not None and config.believe != "nothing":
                 prior = PriorStore.open(self.priors).prior

@@ -31,9 +31,9 @@ POINTS_FORMAT = 1
 MIN_POINTS = 1000
 """Fewer triangulated points than this are filled up with random ones; more random ones cost quality."""
 
-FROM_STEREO, SHORT = 12_000, 1000
-"""Points of a prior's stereo, at most, from which a run of fewer steps starts where hooks insert: right from the first
-step on, and none as large as random ones, which take most of the time. A longer run becomes no better, but larger."""
+FROM_STEREO = 12_000
+"""Points of a prior's stereo, at most, from which a run starts where hooks insert: right from the first step on, and
+none as large as random ones."""
 
 NEIGHBOURS = 3
 """Triangulated points of which a random one that a single camera sees takes the depth of one."""

@@ -14,8 +14,8 @@ from tiny import ALL_HOOKS, BACKBONES, bend_field, make_adapter, make_model, mak
 
 from d2_plugin import D2Config, D2Error, D2Hooks
 from d2_plugin.backbones import trainer as training
-from d2_plugin.backbones.densify import DensifySettings, densify, grow, prune
-from d2_plugin.backbones.model import HELD, STATISTICS, SplatModel
+from d2_plugin.backbones.densify import DensifySettings, grow, prune
+from d2_plugin.backbones.model import SplatModel
 from d2_plugin.backbones.starting import nearest_neighbour_scales
 from d2_plugin.backbones.yang4d import create
 from d2_plugin.gaussians import spherical_harmonics as sh
@@ -45,7 +45,7 @@ def numbered(name: str) -> SplatModel:
         for parameter, state in model.gaussians.optimizer.state.items():
             for moment in ("exp_avg", "exp_avg_sq"):
                 state[moment].copy_(by_row(numbers, parameter))
-    model.gaussians.statistics = dict(zip(STATISTICS, (numbers.clone(), torch.ones(COUNT), numbers.clone())))
+    model.gaussians.statistics = {"screen_gradient": numbers.clone(), "seen": torch.ones(COUNT)}
     return model
 
 
@@ -96,32 +96,11 @@ def test_every_per_gaussian_state_stays_on_its_row(name: str, sequence: list[tup
     assert torch.equal(d2.hooks["prune"].streak.float(), rows)
     assert torch.equal(model.gaussians.statistics["screen_gradient"], rows)
     old = rows > 0
-    assert torch.equal(model.gaussians.statistics["held"][old], rows[old])
     assert torch.equal(model.gaussians["base_colors"][old, 0, 0].detach(), rows[old]), "the report is not true"
     for label, parameter in model.gaussians.parameters.items():
         for moment in ("exp_avg", "exp_avg_sq"):
             state = model.gaussians.optimizer.state[parameter][moment]
             assert torch.equal(state, by_row(rows, state)), (label, moment)
-
-
-def test_what_hooks_insert_leaves_its_place_slowly(backbone: str) -> None:
-    """Each step of its position is shorter, after growth and pruning and in a saved model as well."""
-    model = make_model(COUNT, backbone=backbone)
-    make_adapter(model).insert(some_points(3))
-    model.append(model.initial_rows(some_points(1), model.settings, model.duration))
-    densify(model, DensifySettings(), 100, 1000, generator(0))
-    again = make_model(COUNT, backbone=backbone)
-    again.load_state_dict(model.state_dict())
-    for own in (model, again):
-        positions = own.gaussians["positions"]
-        before = positions.detach()[-4:].clone()
-        positions.grad = torch.ones_like(positions)
-        own.optimize(1, 100)
-        moved = (before - positions.detach()[-4:])[:, 0]
-        torch.testing.assert_close(moved / moved[-1], torch.tensor([1 - HELD] * 3 + [1.0]), rtol=1e-3, atol=0)
-    del model.gaussians.statistics["held"]  # a version before saved none
-    again.load_state_dict(model.state_dict())
-    again.optimize(1, 100)
 
 
 @pytest.mark.parametrize("temporal", [True, False])
