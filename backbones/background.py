@@ -31,8 +31,10 @@ NODES = 40
 """Directions across the image at which the colour is computed; smaller images have one at each pixel."""
 STARTING_IMAGES = 32
 """Images that its first colours are fitted to."""
-RIDGE = 1e-3
+RIDGE = 1e-4
 """Weight of the squared coefficients, times the square of their degree, beside the mean squared error."""
+ACROSS = 0.3
+"""Weight of the mean square of what is not the same all around the vertical: a scene looks alike at one height."""
 UNSEEN = 0.3
 """Weight of half the squared difference from the first colours where no training view looks, mean over all directions.
 Colours of a sky or of a wall that are learnt beside it would else go on to there."""
@@ -60,8 +62,8 @@ class Background:
     def start_from(self, views: Sequence[View], images: Callable[[int], Tensor]) -> None:
         """Begin with what the images show in each direction, as if all of it were at infinity.
 
-        Least squares over the nodes of at most `STARTING_IMAGES` views, spread evenly. A ridge that grows with the
-        degree keeps directions that no camera sees near the mean colour.
+        Least squares over the nodes of at most `STARTING_IMAGES` views, spread evenly. Directions that no camera sees
+        get the colour of those at the same height, where up is the mean of the images' own, and none runs away.
 
         Args:
             images: the image [H, W, 3] in 0..1 of each, by its index in `views`.
@@ -72,13 +74,12 @@ class Background:
         seen = [self._seen(views[index], images(index)) for index in chosen]
         values = torch.cat([harmonics for harmonics, _ in seen]).double()
         colors = torch.cat([color for _, color in seen]).double() - 0.5
-        degrees = torch.tensor([degree for degree in range(DEGREE + 1) for _ in range(2 * degree + 1)])
-        ridge = (RIDGE * len(colors) * degrees.square()).to(values)
-        solved = torch.linalg.solve(values.T @ values + torch.diag(ridge), values.T @ colors)
+        around = _around(DIRECTIONS).to(values)
+        ridge = len(colors) * _ridge(around, _up(views).to(values))
+        solved = torch.linalg.solve(values.T @ values + ridge, values.T @ colors)
         self.constant.copy_(solved[:1])
         self.harmonics.copy_(solved[1:])
         self.first.copy_(solved)
-        around = _around(DIRECTIONS).to(values)
         unseen = basis(around[~torch.stack([_looks(views[index], around) for index in chosen]).any(0)], DEGREE)
         self.unseen.copy_(unseen.T @ unseen / DIRECTIONS)
 
@@ -189,6 +190,21 @@ def _around(count: int) -> Tensor:
     index = torch.arange(count, dtype=torch.float64) + 0.5
     z, turn = 1 - 2 * index / count, math.pi * (1 + math.sqrt(5)) * index
     return torch.stack([(1 - z * z).sqrt() * turn.cos(), (1 - z * z).sqrt() * turn.sin(), z], -1)
+
+
+def _ridge(around: Tensor, up: Tensor) -> Tensor:
+    """What squared coefficients cost, [(DEGREE + 1)^2, (DEGREE + 1)^2]: see `RIDGE` and `ACROSS`."""
+    harmonics = basis(around, DEGREE)
+    heights = (around @ up)[:, None] ** torch.arange(DEGREE + 1, device=up.device)
+    across = harmonics - heights @ (torch.linalg.pinv(heights) @ harmonics)
+    degrees = torch.tensor([degree for degree in range(DEGREE + 1) for _ in range(2 * degree + 1)])
+    return RIDGE * torch.diag(degrees.square()).to(up) + ACROSS * 4 * math.pi / len(around) * across.T @ across
+
+
+def _up(views: Sequence[View]) -> Tensor:
+    """Unit direction [3] that is up in the images on average."""
+    up = -torch.stack([view.T_camera_world[1, :3] for view in views]).mean(0)
+    return up / up.norm().clamp(min=1e-6)
 
 
 def _looks(view: View, directions: Tensor) -> Tensor:
