@@ -167,6 +167,19 @@ class TestStart:
         assert (sky_of(sky, view) - 0.9).abs().mean() < 0.05
         assert ((sky_of(sky, turned(view, math.pi)) - 0.5).abs().mean() < 0.17) == (pull > 0)
 
+    def test_behind_the_cameras_it_is_as_before_them_at_the_same_height(self) -> None:
+        """Also where one of them is turned; where one stands on its head there is no up, and it still runs nowhere."""
+        view = make_views()[0]
+        image = torch.zeros(view.height, view.width, 3)
+        image[: view.height // 2] = 1
+        views = [view, turned(view, 0.3)]
+        shown = sky_of(self.started([image, image], views), turned(view, math.pi))
+        assert shown[:5].mean() > 0.9
+        assert shown[-5:].mean() < 0.1
+        upside_down = replace(view, T_camera_world=torch.diag(torch.tensor([-1.0, -1, 1, 1])) @ view.T_camera_world)
+        shown = sky_of(self.started([image, image], [view, upside_down]), turned(view, math.pi))
+        assert (shown - 0.5).abs().max() < 0.5
+
     def test_left_and_right_are_told_apart(self) -> None:
         view = make_views()[0]
         image = torch.zeros(view.height, view.width, 3)
