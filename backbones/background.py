@@ -8,10 +8,8 @@ no evaluation at each pixel: it is computed at a few directions and interpolated
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
-from dataclasses import replace
 from typing import Any
 
 import torch
@@ -31,15 +29,8 @@ NODES = 40
 """Directions across the image at which the colour is computed; smaller images have one at each pixel."""
 STARTING_IMAGES = 32
 """Images that its first colours are fitted to."""
-RIDGE = 1e-4
+RIDGE = 1e-3
 """Weight of the squared coefficients, times the square of their degree, beside the mean squared error."""
-ACROSS = 0.3
-"""Weight of the mean square of what is not the same all around the vertical: a scene looks alike at one height."""
-UNSEEN = 0.3
-"""Weight of half the squared difference from the first colours where no training view looks, mean over all directions.
-Colours of a sky or of a wall that are learnt beside it would else go on to there."""
-DIRECTIONS = 4000
-"""At how many of them that is known."""
 KEPT_CAMERAS = 256
 """Cameras whose harmonics are kept."""
 
@@ -52,18 +43,14 @@ class Background:
         self.harmonics = nn.Parameter(torch.zeros((DEGREE + 1) ** 2 - 1, 3, device=device))
         groups = [{"params": [self.constant], "lr": RATE}, {"params": [self.harmonics], "lr": RATE / 5}]
         self.optimizer = torch.optim.Adam(groups, eps=1e-15, fused=True)
-        self.first = torch.zeros((DEGREE + 1) ** 2, 3, device=device)
-        """The coefficients of the first colours."""
-        self.unseen = torch.zeros((DEGREE + 1) ** 2, (DEGREE + 1) ** 2, device=device)
-        """What a squared difference of colours is in coefficients, where no training view looks."""
         self._bases: dict[tuple[Any, ...], Tensor] = {}
 
     @torch.no_grad()
     def start_from(self, views: Sequence[View], images: Callable[[int], Tensor]) -> None:
         """Begin with what the images show in each direction, as if all of it were at infinity.
 
-        Least squares over the nodes of at most `STARTING_IMAGES` views, spread evenly. Directions that no camera sees
-        get the colour of those at the same height, where up is the mean of the images' own, and none runs away.
+        Least squares over the nodes of at most `STARTING_IMAGES` views, spread evenly. A ridge that grows with the
+        degree keeps directions that no camera sees near the mean colour.
 
         Args:
             images: the image [H, W, 3] in 0..1 of each, by its index in `views`.
@@ -74,14 +61,11 @@ class Background:
         seen = [self._seen(views[index], images(index)) for index in chosen]
         values = torch.cat([harmonics for harmonics, _ in seen]).double()
         colors = torch.cat([color for _, color in seen]).double() - 0.5
-        around = _around(DIRECTIONS).to(values)
-        ridge = len(colors) * _ridge(around, _up(views).to(values))
-        solved = torch.linalg.solve(values.T @ values + ridge, values.T @ colors)
+        degrees = torch.tensor([degree for degree in range(DEGREE + 1) for _ in range(2 * degree + 1)])
+        ridge = (RIDGE * len(colors) * degrees.square()).to(values)
+        solved = torch.linalg.solve(values.T @ values + torch.diag(ridge), values.T @ colors)
         self.constant.copy_(solved[:1])
         self.harmonics.copy_(solved[1:])
-        self.first.copy_(solved)
-        unseen = basis(around[~torch.stack([_looks(views[index], around) for index in chosen]).any(0)], DEGREE)
-        self.unseen.copy_(unseen.T @ unseen / DIRECTIONS)
 
     def behind(self, render: Render, view: View, change: Tensor | None = None) -> Render:
         """The render with the background, after a `change` of colour, where the Gaussians leave some of a ray."""
@@ -109,11 +93,6 @@ class Background:
 
     def optimize(self, share: float = 1.0) -> None:
         """One optimizer step, gradients cleared; the next one has this share of the learning rates."""
-        if self.constant.grad is not None and self.harmonics.grad is not None:
-            off = torch.cat([self.constant, self.harmonics]).detach() - self.first
-            pull = UNSEEN * (self.unseen[..., None] * off).sum(1)  # not a matrix product, as above
-            self.constant.grad += pull[:1]
-            self.harmonics.grad += pull[1:]
         self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
         for group, rate in zip(self.optimizer.param_groups, (RATE, RATE / 5)):
@@ -140,12 +119,10 @@ class Background:
         return self._bases[key]
 
     def state_dict(self) -> dict[str, Any]:
-        """Colours, those of the beginning, and optimizer."""
+        """Colours and optimizer."""
         return {
             "constant": self.constant.detach().clone(),
             "harmonics": self.harmonics.detach().clone(),
-            "first": self.first.clone(),
-            "unseen": self.unseen.clone(),
             "optimizer": deepcopy(self.optimizer.state_dict()),
         }
 
@@ -154,8 +131,6 @@ class Background:
         """Continue from `state_dict()`."""
         self.constant.copy_(state["constant"])
         self.harmonics.copy_(state["harmonics"])
-        for name in {"first", "unseen"} & {*state}:  # versions before saved none
-            getattr(self, name).copy_(state[name])
         self.optimizer.load_state_dict(deepcopy(state["optimizer"]))
 
 
@@ -183,32 +158,3 @@ def _directions(view: View) -> Tensor:
     pixels = torch.stack([columns, rows, torch.ones_like(rows)], -1).reshape(-1, 3)
     rays = torch.linalg.solve(view.K.to(like), pixels.T).T @ view.T_camera_world[:3, :3]
     return rays / rays.norm(dim=-1, keepdim=True)
-
-
-def _around(count: int) -> Tensor:
-    """Unit directions [count, 3], float64, evenly spread over all: a spiral from pole to pole."""
-    index = torch.arange(count, dtype=torch.float64) + 0.5
-    z, turn = 1 - 2 * index / count, math.pi * (1 + math.sqrt(5)) * index
-    return torch.stack([(1 - z * z).sqrt() * turn.cos(), (1 - z * z).sqrt() * turn.sin(), z], -1)
-
-
-def _ridge(around: Tensor, up: Tensor) -> Tensor:
-    """What squared coefficients cost, [(DEGREE + 1)^2, (DEGREE + 1)^2]: see `RIDGE` and `ACROSS`."""
-    harmonics = basis(around, DEGREE)
-    heights = (around @ up)[:, None] ** torch.arange(DEGREE + 1, device=up.device)
-    across = harmonics - heights @ (torch.linalg.pinv(heights) @ harmonics)
-    degrees = torch.tensor([degree for degree in range(DEGREE + 1) for _ in range(2 * degree + 1)])
-    return RIDGE * torch.diag(degrees.square()).to(up) + ACROSS * 4 * math.pi / len(around) * across.T @ across
-
-
-def _up(views: Sequence[View]) -> Tensor:
-    """Unit direction [3] that is up in the images on average."""
-    up = -torch.stack([view.T_camera_world[1, :3] for view in views]).mean(0)
-    return up / up.norm().clamp(min=1e-6)
-
-
-def _looks(view: View, directions: Tensor) -> Tensor:
-    """In which directions [K, 3] of the world a view looks, bool [K]."""
-    pose = view.T_camera_world.clone()
-    pose[:3, 3] = 0
-    return replace(view, T_camera_world=pose).sees(directions)
