@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from d2_plugin.gaussians import spherical_harmonics as sh
+from d2_plugin.gaussians.nearest import nearest
 from d2_plugin.protocol import Points
 
 
@@ -42,6 +43,5 @@ def nearest_neighbour_scales(positions: Tensor) -> Tensor:
     count = len(positions)
     if count < 2:
         return positions.new_full((count,), 1e-2)
-    k = min(3, count - 1) + 1
-    chunks = [torch.cdist(chunk, positions).topk(k, largest=False).values for chunk in positions.split(1024)]
-    return torch.cat(chunks)[:, 1:].square().mean(-1).sqrt().clamp(min=1e-7)
+    distances, _ = nearest(positions, positions, min(3, count - 1) + 1)
+    return distances[:, 1:].square().mean(-1).sqrt().clamp(min=1e-7)

@@ -9,11 +9,9 @@ import torch
 from torch import Tensor
 
 from d2_plugin.errors import D2Error
+from d2_plugin.gaussians.nearest import nearest
 
 NEIGHBOURS = 3
-
-PAIRS = 1 << 22
-"""Distances held in memory at a time."""
 
 
 def distCUDA2(points: Tensor) -> Tensor:
@@ -27,7 +25,7 @@ def distCUDA2(points: Tensor) -> Tensor:
     if len(points) < 2:
         return torch.zeros(len(points), device=points.device)
     points = points.detach().double()
-    distances, _ = _nearest(points, points, min(NEIGHBOURS, len(points) - 1) + 1)
+    distances, _ = nearest(points, points, min(NEIGHBOURS, len(points) - 1) + 1)
     return distances[:, 1:].square().mean(1).float()
 
 
@@ -39,7 +37,7 @@ def knn(k: int, xyz: Tensor, center_xyz: Tensor | None = None, transposed: bool 
     centers = xyz if center_xyz is None else center_xyz
     if transposed:
         xyz, centers = xyz.transpose(1, 2), centers.transpose(1, 2)
-    pairs = [_nearest(points, queries, k)[1] for points, queries in zip(xyz, centers)]
+    pairs = [nearest(points, queries, k)[1] for points, queries in zip(xyz, centers)]
     return torch.stack(pairs).transpose(1, 2).contiguous().int()
 
 
@@ -59,14 +57,5 @@ class GpuIndexFlatL2:
 
     def search(self, queries: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:
         """Squared distances [M, k] float32 and indices [M, k] int64 of the k nearest points, the nearest first."""
-        distances, indices = _nearest(self._points, torch.from_numpy(np.ascontiguousarray(queries)), k)
+        distances, indices = nearest(self._points, torch.from_numpy(np.ascontiguousarray(queries)), k)
         return distances.square().numpy(), indices.numpy()
-
-
-def _nearest(points: Tensor, queries: Tensor, k: int) -> tuple[Tensor, Tensor]:
-    """Distances and indices [M, k] of the points [N, D] nearest to each query [M, D]."""
-    exact = "donot_use_mm_for_euclid_dist"
-    parts = queries.split(max(PAIRS // max(len(points), 1), 1))
-    each = [torch.cdist(part, points, compute_mode=exact).topk(k, largest=False) for part in parts]
-    distances, indices = (torch.cat(values) for values in zip(*each))
-    return distances, indices

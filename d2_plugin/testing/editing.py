@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
+from d2_plugin.gaussians.nearest import nearest
 from d2_plugin.protocol import Backbone, Points, Splats, View
 from d2_plugin.testing.example import Check, Example, matrices, some_points, some_rows
 
@@ -112,7 +113,7 @@ def _placed(example: Example, view: View, points: Points, index: Tensor) -> Iter
     if not new.any():
         yield "inserted Gaussians are not there at the time of their points"
         return
-    distance = torch.cdist(splats.means[new], points.positions.to(splats.means)).amin(-1)
+    distance, _ = nearest(points.positions.to(splats.means), splats.means[new], 1)
     if (distance < 2 * points.scales.mean()).double().mean() < PLACED:
         yield "inserted Gaussians are not where their points are, at the time of their points"
     wide = matrices(splats.covariances[new].double()).diagonal(dim1=-2, dim2=-1).mean(-1).sqrt().median().item()

@@ -160,7 +160,7 @@ class TestNearest:
         elif kind == "repeated":
             points[count // 2 :] = points[: count - count // 2]
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(nearest, "PAIRS", 64)  # in several parts
+            patch.setattr("d2_plugin.gaussians.nearest.PAIRS", 64)  # in several parts
             result = nearest.distCUDA2(torch.from_numpy(points))
         np.testing.assert_allclose(result, self.brute(points.astype(np.float64)), rtol=1e-6, atol=1e-12)
 
@@ -386,7 +386,7 @@ class TestKinematic:
 
 def test_nearest_points_are_those_of_all_distances(monkeypatch: pytest.MonkeyPatch) -> None:
     """By pytorch3d's knn and by faiss on a GPU."""
-    monkeypatch.setattr(nearest, "PAIRS", 100)  # in several parts
+    monkeypatch.setattr("d2_plugin.gaussians.nearest.PAIRS", 100)  # in several parts
     points, queries = torch.rand(2, 50, 3, generator=torch.Generator().manual_seed(0))
     distances = torch.cdist(queries, points)
     index = nearest.GpuIndexFlatL2(nearest.StandardGpuResources(), 3)

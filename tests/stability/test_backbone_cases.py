@@ -197,6 +197,15 @@ def test_case_19_few_points_start_with_a_finite_scale_whether_apart_or_in_one_pl
 
 
 @both
+@pytest.mark.parametrize("offset", [0.0, 1e3])
+def test_case_19_points_close_together_far_from_the_origin_start_as_wide_as_near_it(offset: float, dtype) -> None:
+    """A matrix product in place of differences loses them there: a hundred-thousandth as wide, in float32."""
+    side = torch.arange(10, dtype=dtype) / 128
+    scales = nearest_neighbour_scales(torch.cartesian_prod(side, side, side) + offset)
+    torch.testing.assert_close(scales, torch.full_like(scales, 1 / 128))
+
+
+@both
 def test_case_21_within_one_ulp_of_tau_v_the_mask_flips_and_gradients_stay_below_the_spread_over_tau_v(dtype) -> None:
     threshold = torch.tensor(TAU_V, dtype=dtype)
     sides = torch.stack([torch.nextafter(threshold, threshold * s) for s in (0, 2)])[None]
