@@ -8,8 +8,10 @@ no evaluation at each pixel: it is computed at a few directions and interpolated
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -29,8 +31,13 @@ NODES = 40
 """Directions across the image at which the colour is computed; smaller images have one at each pixel."""
 STARTING_IMAGES = 32
 """Images that its first colours are fitted to."""
-RIDGE = 1e-3
+RIDGE = 3e-2
 """Weight of the squared coefficients, times the square of their degree, beside the mean squared error."""
+UNSEEN = 0.3
+"""Weight of half the squared difference from the first colours where no training view looks, mean over all directions.
+Colours of a sky or of a wall that are learnt beside it would else go on to there."""
+DIRECTIONS = 4000
+"""At how many of them that is known."""
 KEPT_CAMERAS = 256
 """Cameras whose harmonics are kept."""
 
@@ -43,6 +50,10 @@ class Background:
         self.harmonics = nn.Parameter(torch.zeros((DEGREE + 1) ** 2 - 1, 3, device=device))
         groups = [{"params": [self.constant], "lr": RATE}, {"params": [self.harmonics], "lr": RATE / 5}]
         self.optimizer = torch.optim.Adam(groups, eps=1e-15, fused=True)
+        self.first = torch.zeros((DEGREE + 1) ** 2, 3, device=device)
+        """The coefficients of the first colours."""
+        self.unseen = torch.zeros((DEGREE + 1) ** 2, (DEGREE + 1) ** 2, device=device)
+        """What a squared difference of colours is in coefficients, where no training view looks."""
         self._bases: dict[tuple[Any, ...], Tensor] = {}
 
     @torch.no_grad()
@@ -66,6 +77,10 @@ class Background:
         solved = torch.linalg.solve(values.T @ values + torch.diag(ridge), values.T @ colors)
         self.constant.copy_(solved[:1])
         self.harmonics.copy_(solved[1:])
+        self.first.copy_(solved)
+        around = _around(DIRECTIONS).to(values.device)
+        unseen = basis(around[~torch.stack([_looks(views[index], around) for index in chosen]).any(0)], DEGREE)
+        self.unseen.copy_(unseen.T @ unseen / DIRECTIONS)
 
     def behind(self, render: Render, view: View, change: Tensor | None = None) -> Render:
         """The render with the background, after a `change` of colour, where the Gaussians leave some of a ray."""
@@ -93,6 +108,11 @@ class Background:
 
     def optimize(self, share: float = 1.0) -> None:
         """One optimizer step, gradients cleared; the next one has this share of the learning rates."""
+        if self.constant.grad is not None and self.harmonics.grad is not None:
+            off = torch.cat([self.constant, self.harmonics]).detach() - self.first
+            pull = UNSEEN * (self.unseen[..., None] * off).sum(1)  # not a matrix product, as above
+            self.constant.grad += pull[:1]
+            self.harmonics.grad += pull[1:]
         self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
         for group, rate in zip(self.optimizer.param_groups, (RATE, RATE / 5)):
@@ -119,10 +139,12 @@ class Background:
         return self._bases[key]
 
     def state_dict(self) -> dict[str, Any]:
-        """Colours and optimizer."""
+        """Colours, those of the beginning, and optimizer."""
         return {
             "constant": self.constant.detach().clone(),
             "harmonics": self.harmonics.detach().clone(),
+            "first": self.first.clone(),
+            "unseen": self.unseen.clone(),
             "optimizer": deepcopy(self.optimizer.state_dict()),
         }
 
@@ -131,6 +153,8 @@ class Background:
         """Continue from `state_dict()`."""
         self.constant.copy_(state["constant"])
         self.harmonics.copy_(state["harmonics"])
+        for name in {"first", "unseen"} & {*state}:  # versions before saved none
+            getattr(self, name).copy_(state[name])
         self.optimizer.load_state_dict(deepcopy(state["optimizer"]))
 
 
@@ -158,3 +182,17 @@ def _directions(view: View) -> Tensor:
     pixels = torch.stack([columns, rows, torch.ones_like(rows)], -1).reshape(-1, 3)
     rays = torch.linalg.solve(view.K.to(like), pixels.T).T @ view.T_camera_world[:3, :3]
     return rays / rays.norm(dim=-1, keepdim=True)
+
+
+def _around(count: int) -> Tensor:
+    """Unit directions [count, 3], float64, evenly spread over all: a spiral from pole to pole."""
+    index = torch.arange(count, dtype=torch.float64) + 0.5
+    z, turn = 1 - 2 * index / count, math.pi * (1 + math.sqrt(5)) * index
+    return torch.stack([(1 - z * z).sqrt() * turn.cos(), (1 - z * z).sqrt() * turn.sin(), z], -1)
+
+
+def _looks(view: View, directions: Tensor) -> Tensor:
+    """In which directions [K, 3] of the world a view looks, bool [K]."""
+    pose = view.T_camera_world.clone()
+    pose[:3, 3] = 0
+    return replace(view, T_camera_world=pose).sees(directions)

@@ -155,6 +155,18 @@ class TestStart:
             shown = sky_of(sky, turned(views[0], angle))
             assert (shown - 0.5).abs().max() < 0.4, "least squares ran away where no camera looks"
 
+    @pytest.mark.parametrize("pull", [module.UNSEEN, 0.0])
+    def test_where_no_camera_looks_it_stays_as_begun_while_a_sky_is_learnt(self, pull: float, monkeypatch) -> None:
+        """Also in a saved model; without the pull the other side goes more than half of the way to it."""
+        monkeypatch.setattr(module, "UNSEEN", pull)
+        view, sky = make_views()[0], Background(torch.device("cpu"))
+        sky.load_state_dict(self.started([self.flat(view, (0.5, 0.5, 0.5))], [view]).state_dict())
+        for _ in range(300):
+            (sky_of(sky, view) - 0.9).abs().mean().backward()
+            sky.optimize()
+        assert (sky_of(sky, view) - 0.9).abs().mean() < 0.05
+        assert ((sky_of(sky, turned(view, math.pi)) - 0.5).abs().mean() < 0.17) == (pull > 0)
+
     def test_left_and_right_are_told_apart(self) -> None:
         view = make_views()[0]
         image = torch.zeros(view.height, view.width, 3)
