@@ -167,6 +167,16 @@ class TestStart:
         assert (sky_of(sky, view) - 0.9).abs().mean() < 0.05
         assert ((sky_of(sky, turned(view, math.pi)) - 0.5).abs().mean() < 0.17) == (pull > 0)
 
+    def test_where_all_directions_are_seen_nothing_is_pulled(self) -> None:
+        view = make_views()[0]
+        K = torch.tensor([[view.height / 2.01, 0, view.width / 2], [0, view.height / 2.01, view.height / 2], [0, 0, 1]])
+        flat = replace(view, K=K)
+        tilt = torch.tensor([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]]) @ flat.T_camera_world
+        views = [turned(flat, quarter * math.pi / 2) for quarter in range(4)]
+        views += [replace(flat, T_camera_world=tilt), replace(flat, T_camera_world=tilt @ tilt @ tilt)]
+        sky = self.started([self.flat(view, (0.2, 0.5, 0.9))] * 6, views)
+        assert not sky.unseen.any()
+
     def test_left_and_right_are_told_apart(self) -> None:
         view = make_views()[0]
         image = torch.zeros(view.height, view.width, 3)

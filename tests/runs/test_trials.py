@@ -19,7 +19,7 @@ from d2_plugin.runs.plan import Decision
 from d2_plugin.runs.prior.trials import Trials, can_decide, leave_out_in_turn, left_out, small_prior
 from d2_plugin.runs.run import Run
 from d2_plugin.runs.settings import RunSettings
-from d2_plugin.runs.start import TimedPoints
+from d2_plugin.runs.start import TimedPoints, with_stereo
 from d2_plugin.store.maps import FusedPrior
 from d2_plugin.store.store import PriorStore
 
@@ -115,6 +115,23 @@ def test_depth_is_believed_if_it_is_right_whatever_its_sigma(room, tmp_path, wro
     store = PriorStore.open(stored(tmp_path / "priors", scene.recording, wrong))
     trials = leave_out_in_turn(settings, scene, NO_POINTS, store)
     assert trials.choice == choice
+
+
+def test_a_trial_begins_on_stereo_of_the_cameras_that_train_it_and_of_no_other(room, tmp_path, monkeypatch) -> None:
+    begun = []
+
+    def recorded(points: TimedPoints, recording: Recording, cameras: list[str], prior: object) -> TimedPoints:
+        begun.append((cameras, len(start := with_stereo(points, recording, cameras, prior))))
+        return start
+
+    monkeypatch.setattr("d2_plugin.runs.prior.trials.with_stereo", recorded)
+    monkeypatch.setattr("d2_plugin.runs.prior.trials.STEPS", 1)
+    monkeypatch.setattr("d2_plugin.runs.prior.trials.CLEAR", 2.0)
+    settings = RunSettings(str(room), TRAINED)
+    scene = Run(settings, tmp_path / "run").scene
+    leave_out_in_turn(settings, scene, NO_POINTS, PriorStore.open(stored(tmp_path / "priors", scene.recording, 0.0)))
+    assert [cameras for cameras, _ in begun] == 2 * [["train1", "train2"]] + 2 * [["train0", "train1"]]
+    assert all(count > 1000 for _, count in begun)
 
 
 @pytest.fixture

@@ -34,7 +34,7 @@ from d2_plugin.recordings import open_recording
 from d2_plugin.runs.metrics import ssim_uniform
 from d2_plugin.runs.scene import Scene
 from d2_plugin.runs.settings import HOOK_NAMES, RunSettings, hook_config
-from d2_plugin.runs.start import TimedPoints, make_view
+from d2_plugin.runs.start import TimedPoints, make_view, with_stereo
 from d2_plugin.store.store import TRIALS, PriorStore
 
 LEAST_ITERATIONS = 300
@@ -164,13 +164,15 @@ class _Trial:
         return cls(replace(settings, iterations=STEPS), scene, points, SmallStore(store, factor))
 
     def model(self, cameras: Sequence[str], belief: Belief) -> Any:
-        """A model that some of the cameras trained, in too few steps to gather the evidence that pruning takes."""
+        """A model that some of the cameras trained, begun on their stereo as a run is, in too few steps to gather the
+        evidence that pruning takes."""
         config: Any = hook_config(self.settings, Path())
         config = replace(config, believe=belief, prune=None, parallax=None)
         adapter: Any = registry.load(registry.ADAPTERS, self.settings.backbone)
         scene = replace(self.scene, train_cameras=tuple(cameras))
+        start = with_stereo(self.points, scene.recording, cameras, self.store.prior)
         trainer = scene.trainer(
-            self.settings, self.points, self.points, lambda model: D2Hooks(config, adapter(model), self.store)
+            self.settings, self.points, start, lambda model: D2Hooks(config, adapter(model), self.store)
         )
         trainer.run()
         return trainer.model
