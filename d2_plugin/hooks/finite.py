@@ -16,22 +16,16 @@ class Diverged(D2Error):
 
 
 @torch.no_grad()
-def all_finite(parameters: Mapping[str, Tensor], loss: Tensor | None = None) -> bool:
-    """Whether no parameter is NaN or infinite, nor the loss; asks the device once.
+def what_diverged(parameters: Mapping[str, Tensor], loss: Tensor | None = None) -> str:
+    """Which parameter is not finite, and how much of it; else that the loss is not; nothing where all are.
 
-    A sum is finite only where all its terms are, and reads the tensor once.
+    Asks the device once where all are: a sum is finite only where all its terms are, and reads the tensor once.
     """
     values = [value.sum() for value in parameters.values()] + ([] if loss is None else [loss])
     sums = [value.double().reshape(()).to(values[0].device) for value in values]
     if not sums or bool(torch.stack(sums).isfinite().all()):
-        return True
-    return not what_diverged(parameters, loss)  # the sum of finite numbers may overflow
-
-
-@torch.no_grad()
-def what_diverged(parameters: Mapping[str, Tensor], loss: Tensor | None = None) -> str:
-    """Which parameter is not finite, and how much of it; else that the loss is not; nothing where all are."""
-    for name, value in parameters.items():
+        return ""
+    for name, value in parameters.items():  # the sum of finite numbers may overflow
         bad = 1 - value.isfinite().double().mean().item() if value.numel() else 0.0
         if bad > 0:
             return f"{bad:.2%} of {name} is NaN or infinite"
@@ -66,10 +60,9 @@ class FiniteCheck:
         self.step = step
         if not self.every or not (now or step % self.every == 0):
             return
-        parameters = self._parameters()
-        if all_finite(parameters, self._loss):
+        wrong = what_diverged(self._parameters(), self._loss)
+        if not wrong:
             return
-        wrong = what_diverged(parameters, self._loss)
         if wrong.startswith("the loss"):
             wrong = wrong.replace("the loss", "D2's loss")
         elif self._loss is not None and not bool(self._loss.isfinite()):

@@ -156,8 +156,7 @@ Watch = Callable[[Any], OnStep]
 
 def what_diverged(model: Any, loss: Tensor | None = None) -> str:
     """Which parameter of the model is not finite, else that the loss is not; nothing where all are."""
-    parameters = dict(trained_tensors(model))
-    return "" if finite.all_finite(parameters, loss) else finite.what_diverged(parameters, loss)
+    return finite.what_diverged(dict(trained_tensors(model)), loss)
 
 
 @contextmanager
