@@ -11,8 +11,8 @@ import importlib
 import importlib.util
 import logging
 import sys
-from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import Any
 
 import torch
 
@@ -25,13 +25,6 @@ log = logging.getLogger(__name__)
 STRATEGIES = ("DefaultStrategy", "MCMCStrategy")
 PLACES = (("gsplat.rendering", "rasterization"), ("gsplat", "rasterization"))
 """Where scripts import it from."""
-
-
-class Model(NamedTuple):
-    """What is trained: parameters and optimizers by name."""
-
-    splats: Any
-    optimizers: Mapping[str, torch.optim.Optimizer]
 
 
 def put_in_place() -> None:
@@ -94,7 +87,7 @@ class GsplatSession(Session):
     def _keeping_model(
         self, check_sanity: Callable[..., Any], strategy: Any, params: Any, optimizers: Any, *more: Any, **named: Any
     ) -> Any:
-        self.objects.model = Model(params, optimizers)
+        self.objects.model = params, optimizers
         return check_sanity(strategy, params, optimizers, *more, **named)
 
     def _attaching_to(self, initialize_state: Callable[..., Any], *arguments: Any, **named: Any) -> Any:

@@ -211,12 +211,12 @@ def test_keyframes_become_a_path_that_d2_render_follows(viewed: ViewedRun, tmp_p
 
 
 def test_the_prior_as_points_lies_where_its_pixels_say(viewed: ViewedRun) -> None:
-    cloud = cloud_of(viewed, 0, "label", most=500)
-    assert 50 < len(cloud.positions) <= 700
-    assert np.isfinite(cloud.positions).all()
+    positions, _ = cloud_of(viewed, 0, "label", most=500)
+    assert 50 < len(positions) <= 700
+    assert np.isfinite(positions).all()
     exact = viewed.recording.depth("train0", 0)
     camera = viewed.recording.cameras["train0"]
-    seen = cloud.positions @ camera.T_camera_world[:3, :3].T + camera.T_camera_world[:3, 3]
+    seen = positions @ camera.T_camera_world[:3, :3].T + camera.T_camera_world[:3, 3]
     pixels = (seen @ camera.K.T)[:, :2] / seen[:, 2:]
     inside = (seen[:, 2] > 0) & (pixels >= 0).all(1) & (pixels < (camera.width, camera.height)).all(1)
     truth = exact[tuple(np.floor(pixels[inside]).astype(int).T[::-1])]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -106,11 +106,8 @@ def frustum_size(viewed: ViewedRun) -> float:
     return max(FRUSTUM * float(np.linalg.norm(rig.middle - rig.focus)), 1e-6)
 
 
-class Cloud(NamedTuple):
-    """Points with colours."""
-
-    positions: np.ndarray  # [P, 3] float32, world
-    colors: np.ndarray  # [P, 3] uint8
+Cloud = tuple[np.ndarray, np.ndarray]
+"""Positions in the world, [P, 3] float32, and colours, [P, 3] uint8."""
 
 
 def cloud_of(viewed: ViewedRun, frame: int, by: str, most: int = MOST_POINTS) -> Cloud:
@@ -121,8 +118,9 @@ def cloud_of(viewed: ViewedRun, frame: int, by: str, most: int = MOST_POINTS) ->
     stride = max(int(np.ceil(np.sqrt(sum(prior.depth.numel() for _, prior in priors) / most))), 1)
     parts = [_points(camera, prior, by, stride) for camera, prior in priors]
     if not parts:
-        return Cloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))
-    return Cloud(*(np.concatenate(values) for values in zip(*parts, strict=True)))
+        return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
+    positions, colors = (np.concatenate(values) for values in zip(*parts, strict=True))
+    return positions, colors
 
 
 def _points(camera: Camera, prior: DepthPrior, by: str, stride: int) -> Cloud:
@@ -140,4 +138,4 @@ def _points(camera: Camera, prior: DepthPrior, by: str, stride: int) -> Cloud:
     else:  # grey where no deviation is declared
         sigma = np.full(depth.shape, np.inf, np.float32) if thin.sigma is None else thin.sigma.numpy()
         colors = sigma_colors(sigma, depth)
-    return Cloud(camera.world(pixels[shown], depth[shown]).astype(np.float32), colors[shown])
+    return camera.world(pixels[shown], depth[shown]).astype(np.float32), colors[shown]

@@ -33,15 +33,8 @@ LONGEST = 1 << 16
 """Bytes of a message; the page's have a few hundred."""
 
 
-class Page(NamedTuple):
-    """A server that runs, and its address with the token."""
-
-    server: Any
-    url: str
-
-
-def serve(host: str, port: int) -> Page:
-    """Start to serve at an address, on the next free port where this one is in use.
+def serve(host: str, port: int) -> tuple[Any, str]:
+    """Start to serve at an address, on the next free port where this one is in use: the server, its URL with the token.
 
     Raises:
         D2Error: nothing can listen at that address.
@@ -56,7 +49,7 @@ def serve(host: str, port: int) -> Page:
         server = viser.ViserServer(host=host, port=port, label="D2-4DGS", verbose=False)
     server.gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=True, control_width="medium")
     name = "localhost" if host in ("127.0.0.1", "0.0.0.0") else f"[{host}]" if ":" in host else host
-    return Page(server, f"http://{name}:{server.get_port()}/?token={token}")
+    return server, f"http://{name}:{server.get_port()}/?token={token}"
 
 
 class Access(NamedTuple):
