@@ -74,34 +74,27 @@ D2_FN Floats look_up(const float* from, Integers place) { return (Floats)_mm256_
 D2_FN Floats reordered(Floats a, Integers lane) { return (Floats)_mm256_permutevar8x32_ps((__m256)a, (__m256i)lane); }
 D2_FN unsigned bits(Integers yes) { return unsigned(_mm256_movemask_ps((__m256)yes)); }
 #else
-D2_FN Floats mad(Floats a, Floats b, Floats c) {
-  Floats v;
-  for (int l = 0; l < kLanes; l++) v[l] = mad(a[l], b[l], c[l]);
+// Lane l is lane(l).
+template <class V, class Lane>
+D2_FN V by_lanes(const Lane& lane) {
+  V v;
+  for (int l = 0; l < kLanes; l++) v[l] = lane(l);
   return v;
+}
+D2_FN Floats mad(Floats a, Floats b, Floats c) {
+  return by_lanes<Floats>([&](int l) { return mad(a[l], b[l], c[l]); });
 }
 D2_FN Floats smaller(Floats a, Floats b) { return a < b ? a : b; }
 D2_FN Floats larger(Floats a, Floats b) { return a > b ? a : b; }
-D2_FN Floats root(Floats a) {
-  Floats v;
-  for (int l = 0; l < kLanes; l++) v[l] = root(a[l]);
-  return v;
-}
+D2_FN Floats root(Floats a) { return by_lanes<Floats>([&](int l) { return root(a[l]); }); }
 D2_FN Integers look_up(const unsigned* from, Integers place) {
-  Integers v;
-  for (int l = 0; l < kLanes; l++) v[l] = int(from[place[l]]);
-  return v;
+  return by_lanes<Integers>([&](int l) { return int(from[place[l]]); });
 }
 D2_FN Floats look_up(const float* from, Integers place) {
-  Floats v;
-  for (int l = 0; l < kLanes; l++) v[l] = from[place[l]];
-  return v;
+  return by_lanes<Floats>([&](int l) { return from[place[l]]; });
 }
 // Lane l takes what is in lane lane[l].
-D2_FN Floats reordered(Floats a, Integers lane) {
-  Floats v;
-  for (int l = 0; l < kLanes; l++) v[l] = a[lane[l]];
-  return v;
-}
+D2_FN Floats reordered(Floats a, Integers lane) { return by_lanes<Floats>([&](int l) { return a[lane[l]]; }); }
 // Bit l says whether lane l of a comparison is true.
 D2_FN unsigned bits(Integers yes) {
   unsigned found = 0;
