@@ -140,24 +140,14 @@ class SplatModel(ABC):
         temporal: bool,
         settings: Mapping[str, Any] | None = None,
     ) -> Model:
-        """`from_points` with plain `settings` over the defaults: the entry point `d2_plugin.backbones`."""
-        chosen = cls.settings_from(settings or {}, temporal)
-        return cls.from_points(positions, colors, times, chosen, extent, duration)
+        """A model that starts at coloured points: positions [N, 3] world, colors [N, 3] in 0..1, times [N].
 
-    @classmethod
-    def from_points(
-        cls: type[Model],
-        positions: Tensor,
-        colors: Tensor,
-        times: Tensor,
-        settings: Any,
-        extent: float,
-        duration: float,
-    ) -> Model:
-        """A model that starts at coloured points: positions [N, 3] world, colors [N, 3] in 0..1, times [N]."""
+        `settings` are plain, over the defaults: the entry point `d2_plugin.backbones`.
+        """
+        chosen = cls.settings_from(settings or {}, temporal)
         scales = nearest_neighbour_scales(positions).clamp(max=0.1 * extent)
         points = Points(positions, colors, times, scales, torch.full_like(scales, INITIAL_OPACITY))
-        return cls(cls.initial_rows(points, settings, duration), settings, extent, duration)
+        return cls(cls.initial_rows(points, chosen, duration), chosen, extent, duration)
 
     def __len__(self) -> int:
         return len(self.gaussians)

@@ -9,12 +9,10 @@ from torch import Tensor
 
 from d2_plugin.adapters.deform import DeformAdapter
 from d2_plugin.adapters.yang4d import Yang4DAdapter
-from d2_plugin.backbones.deform import Deform, DeformSettings
-from d2_plugin.backbones.deform_fields import HexPlaneSettings
-from d2_plugin.backbones.densify import DensifySettings
+from d2_plugin.backbones.deform import Deform
 from d2_plugin.backbones.model import SplatModel
 from d2_plugin.backbones.trainer import Trainer, TrainSettings
-from d2_plugin.backbones.yang4d import Yang4D, Yang4DSettings
+from d2_plugin.backbones.yang4d import Yang4D
 from d2_plugin.config import D2Config, DensifyConfig, DepthLossConfig, PruneConfig
 from d2_plugin.plugin import D2Hooks
 from d2_plugin.protocol import DepthPrior, Label, View
@@ -78,14 +76,13 @@ def make_model(
     positions = torch.rand(count, 3, generator=generator) * torch.tensor([3.0, 2.0, 3.0]) + torch.tensor(
         [-1.5, -1, 1.5]
     )
-    growth = DensifySettings(start=0.1, stop=0.9, every=7, gradient=5e-3, budget=150)
     colors, times = torch.rand(count, 3, generator=generator), torch.rand(count, generator=generator) / 2
-    shared = {"temporal": temporal, "densify": growth} | chosen
-    if backbone == "yang4d":
-        model = Yang4D.from_points(positions, colors, times, Yang4DSettings(**shared), extent=2.0, duration=0.5)
-    else:
-        settings = DeformSettings(**shared, hexplane=HexPlaneSettings(features=4, resolutions=(4, 8)))
-        model = Deform.from_points(positions, colors, times, settings, extent=2.0, duration=0.5)
+    settings = {"densify": {"start": 0.1, "stop": 0.9, "every": 7, "gradient": 5e-3, "budget": 150}} | chosen
+    kind: type[SplatModel] = Yang4D
+    if backbone == "deform":
+        kind, settings = Deform, settings | {"hexplane": {"features": 4, "resolutions": [4, 8]}}
+    extents = {"extent": 2.0, "duration": 0.5}
+    model = kind.create(positions, colors, times, **extents, temporal=temporal, settings=settings)
     with torch.no_grad():
         model.gaussians["opacity_logits"].zero_()  # opacity one half: enough to supervise depth from the first step
     return model

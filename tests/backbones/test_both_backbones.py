@@ -223,7 +223,7 @@ def test_images_that_are_not_finite_leave_all_gaussians(backbone: str) -> None:
 
 @pytest.mark.parametrize(("iterations", "looks"), [(47, False), (48, True)])
 def test_a_run_of_eight_steps_for_each_view_takes_a_look_at_each(backbone, iterations, looks) -> None:
-    trainer, counts = make_trainer(iterations=iterations, backbone=backbone, densify=DensifySettings(every=1000)), []
+    trainer, counts = make_trainer(iterations=iterations, backbone=backbone, densify={"every": 1000}), []
     trainer.model.gaussians["opacity_logits"].data[7] = -100.0
     trainer.run(on_step=lambda step, loss: counts.append(len(trainer.model)))
     at = round(0.7 * iterations)
