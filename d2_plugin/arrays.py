@@ -15,24 +15,18 @@ from typing import IO
 
 import numpy as np
 
-from d2_plugin.reading import RESTORE, Unreadable, opened, parsing, shown_path
-
-MOST_BYTES = 1 << 31
-"""Larger arrays are refused unless the caller allows more."""
+from d2_plugin.reading import MOST_BYTES, RESTORE, Unreadable, opened, parsing, shown_path
 
 NUMBERS = "biuf"
 """Kinds of dtype that are numbers: true or false, whole with and without sign, floating."""
 
 
-def read_array(
-    path: Path | str, remedy: str = RESTORE, *, key: str | None = None, most: int = MOST_BYTES
-) -> np.ndarray:
+def read_array(path: Path | str, remedy: str = RESTORE, *, key: str | None = None) -> np.ndarray:
     """The numbers of a .npy file, or of the member `key` of an .npz file.
 
     Args:
         remedy: what to do, the end of the sentence.
         key: name of a member of an .npz; None for a .npy.
-        most: bytes that the array may have.
 
     Raises:
         Unreadable: no such file, not such a file, no plain numbers, more or fewer bytes than its header says, or a
@@ -41,14 +35,14 @@ def read_array(
     name = shown_path(path)
     with opened(path, remedy) as file, parsing(name, remedy):
         if key is None:
-            return _array(file, os.fstat(file.fileno()).st_size, name, remedy, most)
+            return _array(file, os.fstat(file.fileno()).st_size, name, remedy)
         with zipfile.ZipFile(file) as archive:
             if f"{key}.npy" not in archive.namelist():
                 have = ", ".join(member.removesuffix(".npy") for member in archive.namelist()[:8])
                 raise Unreadable(f"{name} has no array '{key}', it has {have or 'none'}: {remedy}")
             size = archive.getinfo(f"{key}.npy").file_size
             with archive.open(f"{key}.npy") as member:
-                found = _array(member, size, f"{key} in {name}", remedy, most)
+                found = _array(member, size, f"{key} in {name}", remedy)
                 member.read()  # the checksum of the member is compared at its end
             return found
 
@@ -59,12 +53,13 @@ def array_names(path: Path | str, remedy: str = RESTORE) -> set[str]:
         return {member.removesuffix(".npy") for member in archive.namelist() if member.endswith(".npy")}
 
 
-def _array(file: IO[bytes], size: int, name: str, remedy: str, most: int) -> np.ndarray:
+def _array(file: IO[bytes], size: int, name: str, remedy: str) -> np.ndarray:
     """The array that begins where `file` stands, whose file has `size` bytes."""
     shape, columns_first, dtype = _header(file, size, name, remedy)
     needed = math.prod(shape) * dtype.itemsize
-    if needed > most:
-        raise Unreadable(f"{name} has {needed} bytes of numbers, more than {most}, the most that is read: {remedy}")
+    if needed > MOST_BYTES:
+        most = f"more than {MOST_BYTES}, the most that is read"
+        raise Unreadable(f"{name} has {needed} bytes of numbers, {most}: {remedy}")
     data = file.read(needed)
     if len(data) != needed:
         raise Unreadable(f"{name} ends after {len(data)} of {needed} bytes of numbers: {remedy}")

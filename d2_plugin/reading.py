@@ -23,7 +23,7 @@ from d2_plugin.older import tomllib
 from d2_plugin.values import fitting
 
 MOST_BYTES = 1 << 31
-"""Larger files are refused unless the caller allows more."""
+"""Larger files are refused unless the caller allows more, and larger arrays."""
 
 MOST_TEXT = 1 << 28
 """Larger texts are refused: their parsed values take up to some thirty times as much memory."""

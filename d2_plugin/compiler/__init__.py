@@ -30,6 +30,7 @@ from pathlib import Path
 
 from d2_plugin.cache import cache_folder, cache_lock, check_private, is_trusted, private_cache
 from d2_plugin.compiler.prebuilt import find as find_prebuilt
+from d2_plugin.compiler.prebuilt import hash_of
 from d2_plugin.durable import write_text
 from d2_plugin.errors import D2Error
 
@@ -108,7 +109,8 @@ def load_library(
     includes = dict.fromkeys(f"-I{file.parent}" for file in (*sources, *headers))
     user = _words("D2_CXXFLAGS", os.environ.get("D2_CXXFLAGS", ""))
     command = [*compiler, *BASE_FLAGS, *_native_flags(tuple(compiler)), *flags, *includes, *user]
-    key = _key(_predefined(tuple(command)), sources, headers, flags)
+    words = [*BASE_FLAGS, *flags, os.environ.get("D2_CXXFLAGS", ""), _predefined(tuple(command))]
+    key = hash_of(words, (*sources, *headers))
     library = cache_folder() / f"{name}-{key}.so"
     with _guard:
         if library not in _loaded:
@@ -132,13 +134,6 @@ def _predefined(command: tuple[str, ...]) -> str:
     if shown.returncode:
         raise CompileError(f"the compiler refuses its flags ({shlex.join(command)}): {shown.stderr.strip()}")
     return shown.stdout
-
-
-def _key(predefined: str, sources: Sequence[Path], headers: Sequence[Path], flags: Sequence[str]) -> str:
-    digest = hashlib.sha256("\0".join([*BASE_FLAGS, *flags, os.environ.get("D2_CXXFLAGS", ""), predefined]).encode())
-    for path in (*sources, *headers):
-        digest.update(hashlib.sha256(path.read_bytes()).digest())
-    return digest.hexdigest()[:20]
 
 
 def _open(library: Path) -> ctypes.CDLL | None:

@@ -49,10 +49,15 @@ LEVELS = {
 
 def file_name(name: str, level: str, sources: Sequence[Path], headers: Sequence[Path], flags: Sequence[str]) -> str:
     """What a compiled library is called: its sources, headers and flags are part of the name."""
-    digest = hashlib.sha256("\0".join(flags).encode())
-    for path in (*sources, *headers):
+    return f"{name}-{hash_of(flags, (*sources, *headers))}-{level}.so"
+
+
+def hash_of(words: Sequence[str], files: Sequence[Path]) -> str:
+    """Twenty letters that stand for words and for what is in files."""
+    digest = hashlib.sha256("\0".join(words).encode())
+    for path in files:
         digest.update(hashlib.sha256(path.read_bytes()).digest())
-    return f"{name}-{digest.hexdigest()[:20]}-{level}.so"
+    return digest.hexdigest()[:20]
 
 
 def find(name: str, sources: Sequence[Path], headers: Sequence[Path], flags: Sequence[str]) -> Path | None:
