@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from d2_plugin.protocol import Points, ResizeListener, Splats, View
+from d2_plugin.protocol import Points, Splats, View
 
 from .inria import InriaAdapter
 from .inverse_deformation import Inversion, invert_at_times
@@ -58,7 +58,7 @@ class Deformable3DAdapter(InriaAdapter):
         exact_times: bool = False,
         key: KeyOf | None = None,
     ) -> None:
-        super().__init__(gaussians, key)
+        super().__init__(gaussians, key, deform.deform)
         self.deform, self.warm_up, self.in_warm_up = deform, warm_up, in_warm_up
         self.exact_times = exact_times
         if warm_up > 1 and not in_warm_up:
@@ -92,11 +92,6 @@ class Deformable3DAdapter(InriaAdapter):
             motion, rotation, scaling = self._evaluated(view, *inputs) if exact else self._own(*inputs)
             means, scales, rotations = self._moved(means, motion), scales + scaling, rotations + rotation
         return splats_of(means, scales, rotations, opacities)
-
-    def on_resize(self, listener: ResizeListener) -> None:
-        """Register a listener; D2Hooks does so only where a hook is on."""
-        super().on_resize(listener)
-        self._keep_evaluations(self.deform.deform)
 
     def _offsets(self, positions: Tensor, time: float) -> tuple[Tensor, Tensor, Tensor]:
         return self.deform.step(positions, positions.new_full((len(positions), 1), time))

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.rotation4d import unit_quaternions
-from d2_plugin.protocol import Points, ResizeListener, Splats, View
+from d2_plugin.protocol import Points, Splats, View
 
 from .inria import InriaAdapter, RenderedCamera
 from .inverse_deformation import Inversion, invert_at_times
@@ -57,16 +57,11 @@ class Hust4DAdapter(InriaAdapter):
         active_stages: tuple[str, ...] = ("fine",),
         key: KeyOf | None = None,
     ) -> None:
-        super().__init__(gaussians, key)
+        super().__init__(gaussians, key, optional(gaussians, "_deformation"))
         self.enter_stage(stage)
         self.active_stages = active_stages
         self.inversion: Inversion | None = None
         self._dataset = optional(optional(scene, "train_camera"), "dataset")
-
-    def on_resize(self, listener: ResizeListener) -> None:
-        """Register a listener; D2Hooks does so only where a hook is on."""
-        super().on_resize(listener)
-        self._keep_evaluations(optional(self.gaussians, "_deformation"))
 
     def enter_stage(self, stage: str) -> None:
         """From now on the model is drawn as in this stage."""

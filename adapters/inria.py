@@ -22,7 +22,7 @@ from torch import Tensor
 from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.rotation4d import identities
 from d2_plugin.gaussians.spherical_harmonics import coefficients_from_rgb
-from d2_plugin.protocol import Points, RasterSettings, Splats, View
+from d2_plugin.protocol import Points, RasterSettings, ResizeListener, Splats, View
 from d2_plugin.rasterizer import rasterize
 
 from .cameras import inria_view
@@ -58,7 +58,8 @@ class RenderedCamera:
 class InriaAdapter(Resizing, ABC):
     """Base of the adapters: everything of the contract but `slice_at` and `_append`.
 
-    `key` finds the prior of a camera object; by default it is read from the image's name.
+    `key` finds the prior of a camera object; by default it is read from the image's name. What the trainer's network
+    `field` returns when it draws a view is kept, with its graph, where a hook is on: D2's depth of the view uses that.
     """
 
     appending: ClassVar[tuple[str, ...]] = ("densification_postfix",)
@@ -68,9 +69,10 @@ class InriaAdapter(Resizing, ABC):
     evidence: ClassVar[dict[str, float]] = {"xyz_gradient_accum": 0.0, "denom": 0.0, "max_radii2D": 0.0}
     """Statistics of existing Gaussians that the repository's insertion would erase, with the value for a new row."""
 
-    def __init__(self, gaussians: Any, key: KeyOf | None = None) -> None:
+    def __init__(self, gaussians: Any, key: KeyOf | None = None, field: Any = None) -> None:
         super().__init__()
         self.gaussians, self.settings = gaussians, RasterSettings()
+        self._network = field
         self.probe: Probe | None = None
         self._key = key
         self._renders: Renders[Mapping[str, Any]] = Renders()
@@ -187,10 +189,11 @@ class InriaAdapter(Resizing, ABC):
             return None
         return package["depth"].reshape(view.height, view.width), package["alpha"].reshape(view.height, view.width)
 
-    def _keep_evaluations(self, field: Any) -> None:
-        """Keep what the trainer's field returns when it draws a view, with its graph: D2's depth of it uses that."""
-        if self._watched is None and isinstance(field, torch.nn.Module):
-            self._watched = field.register_forward_hook(lambda _, __, result: self._keep(result))
+    def on_resize(self, listener: ResizeListener) -> None:
+        """Register a listener; D2Hooks does so only where a hook is on."""
+        super().on_resize(listener)
+        if self._watched is None and isinstance(self._network, torch.nn.Module):
+            self._watched = self._network.register_forward_hook(lambda _, __, result: self._keep(result))
 
     def _keep(self, result: tuple[Any, ...]) -> tuple[Any, ...]:
         """Keep an evaluation for the view that comes next, if the trainer made it with gradients; returns it."""
