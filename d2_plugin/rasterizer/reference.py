@@ -13,6 +13,7 @@ With a near edge D_near(p) of what a depth prior allows, front(p) = sum_i w_i ma
 
 from __future__ import annotations
 
+import functools
 from typing import NamedTuple
 
 import torch
@@ -68,7 +69,10 @@ def rasterize(
     screen = project(_take(splats, kept), view, settings, None if screen_offsets is None else screen_offsets[kept])
     values = torch.cat([colors[kept], screen.depths[:, None], torch.ones_like(screen.depths)[:, None]], 1)
     edge = None if near_edge is None else _known(near_edge, screen.depths)
-    image = torch.cat([_tile_row(screen, values, view, settings, edge, y) for y in range(0, view.height, TILE)], 0)
+    # The backward pass computes a row of tiles again, which bounds memory by that row instead of the image.
+    again = functools.partial(checkpoint, _tile_row, use_reentrant=False)
+    row = again if torch.is_grad_enabled() else _tile_row
+    image = torch.cat([row(screen, values, view, settings, edge, y) for y in range(0, view.height, TILE)], 0)
     # A loss that divides by alpha sends NaN where nobody contributes, which 0 times a weight would not silence.
     image = torch.where(image[..., -1:].detach() > 0, image, 0)
     color, depth_sum, alpha = image[..., : colors.shape[1]], image[..., colors.shape[1]], image[..., -1]
@@ -81,15 +85,7 @@ def _tile_row(
     screen: Projection, values: Tensor, view: View, settings: RasterSettings, edge: Tensor | None, y: int
 ) -> Tensor:
     """Composited `values` [K, V] of a row of tiles, [h, W, V]; with `edge` the weight in front of it is inserted before
-    the last. The backward pass computes it again, which bounds memory by one row of tiles instead of the image."""
-    if torch.is_grad_enabled():
-        return checkpoint(_composite_row, screen, values, view, settings, edge, y, use_reentrant=False)
-    return _composite_row(screen, values, view, settings, edge, y)
-
-
-def _composite_row(
-    screen: Projection, values: Tensor, view: View, settings: RasterSettings, edge: Tensor | None, y: int
-) -> Tensor:
+    the last."""
     height, row = min(TILE, view.height - y), []
     for x in range(0, view.width, TILE):
         weights, front_to_back = _tile_weights(screen, view, settings, x, y)
