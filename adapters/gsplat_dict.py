@@ -77,7 +77,7 @@ class GsplatAdapter(Resizing):
         self.settings = settings
         self._view = view if parser is None else ViewsByPose(parser)
         self._slice, self._new_rows, self.scene = slice_at, new_rows, scene
-        self._renders: Renders[tuple[Tensor, Tensor]] = Renders()
+        self._renders: Renders[tuple[Tensor, Tensor]] = {}
         self._known = 0
         self._renumber()
 
@@ -101,15 +101,15 @@ class GsplatAdapter(Resizing):
 
         D2 then uses the trainer's own depth, the fourth channel [C, H, W], and alpha [C, H, W], and draws nothing.
         """
-        self._renders.forget()
+        self._renders.clear()
         views = [self.view(camera) for camera in cameras]
         for view, depth_sum, alpha in zip(views, depth_sums, alphas):
-            self._renders.put(view, (depth_sum, alpha))
+            self._renders[view.camera, view.frame] = depth_sum, alpha
         return views
 
     def rendered_depth(self, view: View) -> tuple[Tensor, Tensor] | None:
         """Depth sum and alpha of the trainer's render of this view, or None; hands them out once."""
-        return self._renders.take(view)
+        return self._renders.pop((view.camera, view.frame), None)
 
     def slice_at(self, view: View) -> Splats:
         """The 3D Gaussians at `view.time`, differentiable."""

@@ -75,8 +75,8 @@ class InriaAdapter(Resizing, ABC):
         self._network = field
         self.probe: Probe | None = None
         self._key = key
-        self._renders: Renders[Mapping[str, Any]] = Renders()
-        self._evaluations: Renders[tuple[Tensor, ...]] = Renders()
+        self._renders: Renders[Mapping[str, Any]] = {}
+        self._evaluations: Renders[tuple[Tensor, ...]] = {}
         self._unassigned: deque[tuple[Tensor, ...]] = deque(maxlen=64)  # of one batch
         self._watched: Any = None
         self._asking = False
@@ -101,9 +101,9 @@ class InriaAdapter(Resizing, ABC):
                 raise D2Error(f"a camera of type {kind} has no {name}: pass the trainer's own, or a d2_plugin View")
         view = inria_view(camera, self._key_of(camera), self._time(camera), self.gaussians._xyz)
         if package is not None:
-            self._renders.put(view, package)
+            self._renders[view.camera, view.frame] = package
         if self._unassigned:  # views are asked for in the order in which they were drawn
-            self._evaluations.put(view, self._unassigned.popleft())
+            self._evaluations[view.camera, view.frame] = self._unassigned.popleft()
         return view
 
     def prior_key(self, camera: Any) -> PriorKey:
@@ -124,8 +124,8 @@ class InriaAdapter(Resizing, ABC):
     def begin_step(self, step: int) -> None:
         """Note the training step; renders of earlier steps are out of date and forgotten."""
         if step != self._step:
-            self._renders.forget()
-            self._evaluations.forget()
+            self._renders.clear()
+            self._evaluations.clear()
         self._step = step
 
     def pace(self, step: int) -> float:
@@ -179,7 +179,7 @@ class InriaAdapter(Resizing, ABC):
     def rendered_depth(self, view: View) -> tuple[Tensor, Tensor] | None:
         """Depth sum and alpha [H, W] of the package that came with this view in the present step, or None; hands it out
         once."""
-        package = self._renders.take(view)
+        package = self._renders.pop((view.camera, view.frame), None)
         if package is None:
             self._log_once("no render of the trainer was passed along: D2 renders depth with its own rasterizer")
             return None
@@ -205,8 +205,8 @@ class InriaAdapter(Resizing, ABC):
         """What the trainer's own evaluation for this view returned in the present step, else ours of `field`."""
         if self._unassigned:  # more evaluations than views: which is whose is not known
             self._unassigned.clear()
-            self._evaluations.forget()
-        known = self._evaluations.take(view) if torch.is_grad_enabled() else None
+            self._evaluations.clear()
+        known = self._evaluations.pop((view.camera, view.frame), None) if torch.is_grad_enabled() else None
         return known if known is not None and len(known[0]) == len(self) else self._own(field, *inputs)
 
     def _own(self, field: Callable[..., Any], *inputs: Any) -> Any:

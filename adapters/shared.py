@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable
 from dataclasses import replace
 from functools import lru_cache
-from typing import Any, Generic, TypeVar
+from typing import Any, TypeVar
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -18,6 +18,12 @@ from d2_plugin.gaussians.spherical_harmonics import colors as harmonic_colors
 from d2_plugin.protocol import Points, ResizeListener, Splats, View
 
 Render = TypeVar("Render")
+Renders = dict[tuple[str, int], Render]
+"""Renders of the views of one step, a batch of them as well, by camera and frame; each is handed out once (`pop`).
+
+A render holds a graph, and is out of date once the parameters change: whoever keeps them clears all of them then.
+"""
+
 Answer = TypeVar("Answer")
 
 
@@ -34,28 +40,6 @@ class Resizing:
     def _report(self, index: Tensor) -> None:
         for listener in self._listeners:
             listener(index)
-
-
-class Renders(Generic[Render]):
-    """Renders of the views of one step, a batch of them as well, by camera and frame; each is handed out once.
-
-    A render holds a graph, and is out of date once the parameters change: whoever keeps them calls `forget` then.
-    """
-
-    def __init__(self) -> None:
-        self._by_key: dict[tuple[str, int], Render] = {}
-
-    def put(self, view: View, render: Render) -> None:
-        """Keep the render of a view; a later one of the same camera and frame takes its place."""
-        self._by_key[view.camera, view.frame] = render
-
-    def take(self, view: View) -> Render | None:
-        """The render of this view, if there is one that has not been handed out."""
-        return self._by_key.pop((view.camera, view.frame), None)
-
-    def forget(self) -> None:
-        """Forget all renders."""
-        self._by_key.clear()
 
 
 def once_per_camera(name: str, ask: Callable[[Any], Answer]) -> Callable[[Any], Answer]:

@@ -22,7 +22,7 @@ class WatchedModel(Resizing, Observer, Generic[Model]):
     def __init__(self, model: Model) -> None:
         super().__init__()
         self.model = model
-        self._renders: Renders[tuple[Tensor, Tensor]] = Renders()
+        self._renders: Renders[tuple[Tensor, Tensor]] = {}
         model.observers.append(self)
 
     @property
@@ -64,7 +64,7 @@ class WatchedModel(Resizing, Observer, Generic[Model]):
 
     def rendered_depth(self, view: View) -> tuple[Tensor, Tensor] | None:
         """Depth sum and alpha of the trainer's render of this view in the present step, or None; hands it out once."""
-        return self._renders.take(view)
+        return self._renders.pop((view.camera, view.frame), None)
 
     def resized(self, index: Tensor) -> None:
         """The model's Gaussians changed, by its own densification or through this adapter."""
@@ -72,10 +72,10 @@ class WatchedModel(Resizing, Observer, Generic[Model]):
 
     def rendered(self, view: View, render: Render) -> None:
         """Keep a render; one without gradients only drops the earlier render of its view."""
-        self._renders.take(view)
+        self._renders.pop((view.camera, view.frame), None)
         if render.alpha.requires_grad:
-            self._renders.put(view, (render.depth_sum, render.alpha))
+            self._renders[view.camera, view.frame] = render.depth_sum, render.alpha
 
     def optimized(self) -> None:
         """The parameters changed: renders made with the old ones are out of date and forgotten."""
-        self._renders.forget()
+        self._renders.clear()

@@ -169,7 +169,7 @@ def last_only(adapter: WatchedModel) -> None:
     rendered = adapter.rendered
 
     def remember(view: View, render: Render) -> None:
-        adapter._renders.forget()
+        adapter._renders.clear()
         rendered(view, render)
 
     adapter.rendered = remember
@@ -177,18 +177,19 @@ def last_only(adapter: WatchedModel) -> None:
 
 def swaps_a_batch(adapter: WatchedModel) -> None:
     """Hands out the renders of a batch in the wrong order."""
-    rendered_depth, put = adapter.rendered_depth, adapter._renders.put
+    rendered_depth, rendered = adapter.rendered_depth, adapter.rendered
     views: list[View] = []
 
-    def remember(view: View, render: object) -> None:
-        views.append(view)
-        put(view, render)
+    def remember(view: View, render: Render) -> None:
+        if render.alpha.requires_grad:
+            views.append(view)
+        rendered(view, render)
 
     def wrong(view: View) -> object:
         others = [other for other in views[-2:] if other is not view]
         return rendered_depth(view if view not in views or not others else others[0])
 
-    adapter._renders.put, adapter.rendered_depth = remember, wrong
+    adapter.rendered, adapter.rendered_depth = remember, wrong
 
 
 MIRROR = torch.diag(torch.tensor([1.0, -1, 1, 1]))
