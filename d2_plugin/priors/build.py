@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from d2_plugin.compiler import NoCompiler
-from d2_plugin.errors import D2Error, refuse_unknown
+from d2_plugin.errors import D2Error
 from d2_plugin.priors.construct import CONSTRUCTION_VERSION, ViewSources, compares_cameras, construct
 from d2_plugin.priors.cross_view import kernel as cross_view
 from d2_plugin.priors.depth_on_disk import DepthOnDisk, find_depth_on_disk
@@ -28,6 +28,7 @@ from d2_plugin.priors.stereo.matched_depth import MatchedDepth, frame_blocks
 from d2_plugin.priors.stereo.settings import NO_MATCHER
 from d2_plugin.priors.summary import PriorSummary
 from d2_plugin.recordings.recording import Camera, MonoKind, Recording
+from d2_plugin.recordings.selection import select_cameras
 from d2_plugin.store.files import hash_of
 from d2_plugin.store.store import PriorStore, not_of
 
@@ -70,7 +71,7 @@ def build_priors(
             recording, no compiler for the kernels, or a disk that is full, broken or not ours.
     """
     output, names = Path(output), list(cameras)
-    _check(recording, names)
+    select_cameras(recording, names)  # refuses none, an unknown one, and one that is named twice
     _refuse_without_kernels()
     frames = _shard(recording.frames, settings, shard)
     _refuse_other_images(recording, names, output)
@@ -316,11 +317,3 @@ def _shard(frames: Sequence[int], settings: PriorSettings, shard: tuple[int, int
     if not 0 <= index < count:
         raise D2Error(f"shard {index} of {count} does not exist: give an index from 0 to {count - 1}")
     return [number for block in frame_blocks(frames, settings.stereo)[index::count] for number in block]
-
-
-def _check(recording: Recording, names: list[str]) -> None:
-    if not names:
-        raise D2Error("no camera was chosen for the priors: name at least one")
-    refuse_unknown("camera", names, recording.cameras)
-    if len(set(names)) < len(names):
-        raise D2Error(f"a camera is named twice in {', '.join(names)}: name each once")
