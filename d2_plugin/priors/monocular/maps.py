@@ -69,16 +69,7 @@ def mono_source(recording: Recording, settings: PriorSettings, cache: Path) -> M
         D2Error: a network without a declared kind, a declared kind that contradicts the recording's, or relative maps
             along the ray.
     """
-    source = _named_source(recording, settings, cache)
-    if source is not None and source.kind == "relative" and settings.mono_along == "ray":
-        raise D2Error(
-            "mono_along = ray needs metric maps but these are relative, whose shift is that of planar inverse depth: "
-            "leave mono_along out"
-        )
-    return source
-
-
-def _named_source(recording: Recording, settings: PriorSettings, cache: Path) -> MonoSource | None:
+    source: MonoSource
     if settings.mono_onnx:
         if settings.mono_kind is None:
             raise D2Error(
@@ -88,12 +79,19 @@ def _named_source(recording: Recording, settings: PriorSettings, cache: Path) ->
         model = MonocularModel(
             settings.mono_onnx, settings.mono_kind, settings.mono_preprocessing, settings.mono_threads
         )
-        return MapsFromNetwork(model, cache)
-    if recording.mono_kind is None:
+        source = MapsFromNetwork(model, cache)
+    elif recording.mono_kind is None:
         return None
-    if settings.mono_kind not in (None, recording.mono_kind):
+    elif settings.mono_kind not in (None, recording.mono_kind):
         raise D2Error(
             f"mono_kind = {settings.mono_kind} but the maps of {recording.name} are declared {recording.mono_kind}: "
             "leave mono_kind out, or correct cameras.json"
         )
-    return MapsOnDisk(recording, recording.mono_kind)
+    else:
+        source = MapsOnDisk(recording, recording.mono_kind)
+    if source.kind == "relative" and settings.mono_along == "ray":
+        raise D2Error(
+            "mono_along = ray needs metric maps but these are relative, whose shift is that of planar inverse depth: "
+            "leave mono_along out"
+        )
+    return source
