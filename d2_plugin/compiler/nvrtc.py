@@ -22,6 +22,7 @@ import torch
 
 from d2_plugin.cache import cache_folder, check_private, is_trusted, private_cache
 from d2_plugin.compiler import CompileError
+from d2_plugin.compiler.prebuilt import hash_of
 from d2_plugin.errors import D2Error
 
 logger = logging.getLogger(__name__)
@@ -138,10 +139,8 @@ def build(name: str, code: Program, flags: Sequence[str], capability: int) -> Bi
     """
     compiler = library()
     architecture = compiler.architecture_for(capability)
-    digest = hashlib.sha256(repr((tuple(flags), architecture, compiler.version)).encode())
-    for path in (code.source, *code.headers):
-        digest.update(hashlib.sha256(path.read_bytes()).digest())
-    entry = cache_folder() / f"{name}-{architecture}-{digest.hexdigest()[:20]}.cubin"
+    key = hash_of([repr((tuple(flags), architecture, compiler.version))], (code.source, *code.headers))
+    entry = cache_folder() / f"{name}-{architecture}-{key}.cubin"
     if (binary := _read_entry(entry)) is None:
         start = time.perf_counter()
         binary = compiler.compile(code, architecture, flags)

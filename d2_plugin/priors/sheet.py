@@ -103,14 +103,15 @@ def label_colors(labels: np.ndarray) -> np.ndarray:
     return palette[labels]
 
 
-def sigma_colors(sigma: np.ndarray, depth: np.ndarray) -> np.ndarray:
+def sigma_colors(sigma: np.ndarray | None, depth: np.ndarray) -> np.ndarray:
     """RGB uint8 [H, W, 3] of log sigma from `SURE` (dark) to `UNSURE` (bright); `UNKNOWN` if infinite, black if empty.
 
     Args:
-        sigma: relative standard deviation [H, W].
+        sigma: relative standard deviation [H, W]; None where none is declared, which is infinite.
         depth: D* [H, W], 0 where there is none.
     """
     cv2 = opencv("the contact sheet")
+    sigma = np.full(depth.shape, np.inf, np.float32) if sigma is None else sigma
     inside = np.clip(sigma, SURE, UNSURE)
     level = np.log(inside / SURE) / np.log(UNSURE / SURE)
     colors = cv2.applyColorMap((255 * level).astype(np.uint8), cv2.COLORMAP_INFERNO)[..., ::-1]
@@ -122,7 +123,7 @@ def sigma_colors(sigma: np.ndarray, depth: np.ndarray) -> np.ndarray:
 def _row(cv2: ModuleType, image: np.ndarray, prior: DepthPrior, caption: str, width: int) -> np.ndarray:
     size = (width, min(max(1, round(width * image.shape[0] / image.shape[1])), 10 * width))
     depth, labels = prior.depth.numpy(), prior.labels.numpy()
-    sigma = np.full(depth.shape, np.inf, np.float32) if prior.sigma is None else prior.sigma.numpy()
+    sigma = None if prior.sigma is None else prior.sigma.numpy()
     # Of a far pixel only a lower bound is known, so it takes no part in the colours of depth and sigma.
     far = labels == Label.FAR
     surface = np.where(far, 0, depth)

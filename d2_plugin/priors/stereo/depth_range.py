@@ -10,6 +10,7 @@ import numpy as np
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.geometry import check_depth_range, projected, same_spot, seen_by
 from d2_plugin.priors.stereo.settings import StereoSettings
+from d2_plugin.recordings.cameras.camera import rig_width
 from d2_plugin.recordings.recording import Camera
 
 FEWEST = 100
@@ -56,13 +57,11 @@ def depth_bounds(
 
 def _bounds_from_baselines(cameras: Sequence[Camera], max_angle: float) -> DepthBounds:
     """From where two cameras begin to see something alike to half a pixel of disparity between the farthest pair."""
-    centres = np.stack([camera.centre for camera in cameras])
-    distances = np.linalg.norm(centres[:, None] - centres[None], axis=-1)
     pairs = [(a, b) for a in cameras for b in cameras if not same_spot(a, b)]
     if not pairs:
         names = ", ".join(camera.name for camera in cameras)
         raise D2Error(f"cameras {names} stand at one point, so nothing can be triangulated: use cameras that are apart")
-    far = max(float(camera.K[0, 0]) for camera in cameras) * float(distances.max()) / 0.5
+    far = max(float(camera.K[0, 0]) for camera in cameras) * rig_width(cameras) / 0.5
     nearest = np.concatenate([_first_shared_depths(reference, source, far, max_angle) for reference, source in pairs])
     if nearest.size == 0:
         return DepthBounds(far / 1e4, far, "baselines alone, and no two cameras see the same")

@@ -136,6 +136,5 @@ def _points(camera: Camera, prior: DepthPrior, by: str, stride: int) -> Cloud:
     elif by == "label":
         colors = label_colors(thin.labels.numpy())
     else:  # grey where no deviation is declared
-        sigma = np.full(depth.shape, np.inf, np.float32) if thin.sigma is None else thin.sigma.numpy()
-        colors = sigma_colors(sigma, depth)
+        colors = sigma_colors(None if thin.sigma is None else thin.sigma.numpy(), depth)
     return camera.world(pixels[shown], depth[shown]).astype(np.float32), colors[shown]
