@@ -105,6 +105,11 @@ def encode_jpeg(image: np.ndarray, quality: int) -> bytes:
     return encoded
 
 
+def color_bytes(colors: np.ndarray) -> np.ndarray:
+    """uint8 of colours in 0..1."""
+    return np.clip(np.rint(np.asarray(colors) * 255), 0, 255).astype(np.uint8)
+
+
 def shrink_image(image: np.ndarray, factor: int) -> np.ndarray:
     """Mean over blocks of factor x factor pixels, uint8 [H // factor, W // factor, 3]; an incomplete block is cut off.
 

@@ -32,11 +32,6 @@ def colorize(values: np.ndarray, low: float, high: float, colors: np.ndarray) ->
     return colors[np.rint(place).astype(np.int64)]
 
 
-def as_bytes(image: np.ndarray) -> np.ndarray:
-    """RGB uint8 of an image in 0..1."""
-    return np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8)
-
-
 def depth_scale(depths: Sequence[np.ndarray]) -> Scale:
     """1st and 99th percentile of the known depths of several maps; (0, 1) where none is known."""
     known = np.concatenate([depth[np.isfinite(depth) & (depth > 0)] for depth in depths]) if depths else np.zeros(0)

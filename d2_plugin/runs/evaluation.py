@@ -14,11 +14,11 @@ from d2_plugin.durable import make_folder
 from d2_plugin.errors import D2Error
 from d2_plugin.hooks.densify import rendered_depth
 from d2_plugin.progress import progress_bar
-from d2_plugin.recordings.images import write_png
+from d2_plugin.recordings.images import color_bytes, write_png
 from d2_plugin.recordings.recording import Recording
 from d2_plugin.recordings.selection import spread
 from d2_plugin.runs import metrics
-from d2_plugin.runs.drawing import Panel, as_bytes, depth_panel, depth_scale, error_panel, side_by_side
+from d2_plugin.runs.drawing import Panel, depth_panel, depth_scale, error_panel, side_by_side
 from d2_plugin.runs.lpips import SMALLEST, Lpips, find_lpips
 from d2_plugin.runs.plan import CHANGED, MOVING_SHARE
 from d2_plugin.runs.scene import Scene
@@ -205,8 +205,8 @@ def _panels(
     row: dict[str, Any], truth: np.ndarray, color: np.ndarray, depth: Tensor | None, true_depth: np.ndarray | None
 ) -> list[Panel]:
     panels = [
-        Panel(f"truth  {row['camera']}  frame {row['frame']}", as_bytes(truth)),
-        Panel(f"rendered  {row['psnr']:.2f} dB", as_bytes(color)),
+        Panel(f"truth  {row['camera']}  frame {row['frame']}", color_bytes(truth)),
+        Panel(f"rendered  {row['psnr']:.2f} dB", color_bytes(color)),
     ]
     score = "" if row["depth_absrel"] is None else f"  AbsRel {row['depth_absrel']:.3f}"
     maps = {"depth": (None if depth is None else depth.numpy(), score), "true depth": (true_depth, "")}

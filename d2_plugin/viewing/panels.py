@@ -10,8 +10,8 @@ import numpy as np
 from torch import Tensor
 
 from d2_plugin.protocol import View
-from d2_plugin.recordings.images import opencv
-from d2_plugin.runs.drawing import Panel, Scale, as_bytes, colorize, depth_panel, error_panel
+from d2_plugin.recordings.images import color_bytes, opencv
+from d2_plugin.runs.drawing import Panel, Scale, colorize, depth_panel, error_panel
 from d2_plugin.viewing.rendering import RenderedView, render_view
 from d2_plugin.viewing.viewed import ViewedRun
 
@@ -59,7 +59,7 @@ def error(shot: Shot) -> Panel:
 
 
 KINDS: dict[str, Callable[[Shot], Panel]] = {
-    "rgb": lambda shot: Panel("render", as_bytes(shot.rendered.color.numpy())),
+    "rgb": lambda shot: Panel("render", color_bytes(shot.rendered.color.numpy())),
     "depth": lambda shot: depth_panel("depth", shot.rendered.depth.numpy(), shot.depths),
     "alpha": lambda shot: Panel("alpha 0..1", colorize(shot.rendered.alpha.numpy(), 0, 1, GREYS), GREYS),
     "truth": lambda shot: Panel("recorded", shot.truth),

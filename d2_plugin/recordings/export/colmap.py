@@ -12,8 +12,8 @@ from d2_plugin.errors import D2Error
 from d2_plugin.recordings.cameras.rotations import quaternion_of_rotation
 from d2_plugin.recordings.export.base import Export, Written, refuse_off_centre
 from d2_plugin.recordings.export.n3dv import depth_bounds, llff_row
-from d2_plugin.recordings.export.ply import PointCloud, color_bytes, write_point_cloud
-from d2_plugin.recordings.images import encode_jpeg
+from d2_plugin.recordings.export.ply import PointCloud, write_point_cloud
+from d2_plugin.recordings.images import color_bytes, encode_jpeg
 from d2_plugin.recordings.recording import Camera
 
 PINHOLE = 1  # COLMAP's number of the camera model with fx, fy, cx, cy

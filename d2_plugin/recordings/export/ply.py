@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from d2_plugin.errors import D2Error
+from d2_plugin.recordings.images import color_bytes
 
 
 class PointCloud(NamedTuple):
@@ -56,8 +57,3 @@ def write_point_cloud(path: Path, cloud: PointCloud) -> None:
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
     lines += [f"property {kinds[kind]} {name}" for name, kind in layout]
     path.write_bytes(("\n".join([*lines, "end_header"]) + "\n").encode() + rows.tobytes())
-
-
-def color_bytes(colors: np.ndarray) -> np.ndarray:
-    """uint8 of colours in 0..1."""
-    return np.clip(np.rint(np.asarray(colors) * 255), 0, 255).astype(np.uint8)
