@@ -58,7 +58,7 @@ def test_a_small_image_gets_the_depth_of_the_middle_of_its_pixels_and_their_mean
 
 
 def test_ssim_at_left_out_cameras_decides_and_one_line_says_so() -> None:
-    helps, harms = Trials({"a": GOOD}, {"a": BAD}, 1.0), Trials({"a": BAD}, {"a": GOOD}, 1.0)
+    helps, harms = Trials({"a": GOOD}, {"a": BAD}, 0.0, 1.0), Trials({"a": BAD}, {"a": GOOD}, 9.0, 1.0)
     assert (helps.choice, harms.choice) == ("all", "stereo")
     assert "confirms stereo, which alone is used (left-out cameras: SSIM 0.700 with it, 0.800 without)" in str(harms)
     assert "the whole prior is used" in str(helps)
@@ -67,15 +67,24 @@ def test_ssim_at_left_out_cameras_decides_and_one_line_says_so() -> None:
 
 def test_where_a_network_adds_nothing_stereo_alone_is_used() -> None:
     """Both are the same training then: what is simpler is said."""
-    assert Trials({"a": GOOD}, {"a": GOOD}, 1.0).choice == "stereo"
+    assert Trials({"a": GOOD}, {"a": GOOD}, 0.0, 1.0).choice == "stereo"
 
 
-@pytest.mark.parametrize(("behind", "choice"), [(0.004, "all"), (0.006, "stereo")])
-def test_a_tie_goes_to_what_knows_more_depth(behind: float, choice: str) -> None:
-    """*studio* with every second instant is .004 behind, and .6 dB better after 2000 steps; *dome* 02 05 18 22 .007."""
-    trials = Trials({"a": GOOD - behind}, {"a": GOOD}, 1.0)
+@pytest.mark.parametrize(
+    ("ahead", "gain", "choice"),
+    [
+        (-0.004, 3.9, "all"),
+        (-0.004, 2.5, "stereo"),
+        (0.004, 2.5, "stereo"),
+        (-0.006, 3.9, "stereo"),
+        (0.006, 0.0, "all"),
+    ],
+)
+def test_in_a_tie_the_maps_are_used_where_they_are_good(ahead: float, gain: float, choice: str) -> None:
+    """*studio* with every second instant, and *dome* 02 07 22: level in trials, not after 2000 steps."""
+    trials = Trials({"a": GOOD + ahead}, {"a": GOOD}, gain, 1.0)
     assert trials.choice == choice
-    assert ("changes little and fills what stereo leaves empty: the whole prior" in str(trials)) == (choice == "all")
+    assert ("times as far off without it where stereo was left out" in str(trials)) == (abs(ahead) < 0.005)
 
 
 @pytest.mark.parametrize(("ahead", "asked"), [(0.015, 4), (0.025, 2)])
@@ -83,7 +92,7 @@ def test_one_camera_decides_where_it_is_clear_else_the_mean_of_two(ahead, asked,
     """*dome* 02 12 15 18: the first camera finds the whole prior better by .010, the second worse by .017."""
     scores = iter([GOOD + ahead, GOOD, GOOD - 2 * ahead, GOOD])
     made: list[object] = []
-    trial = SimpleNamespace(model=lambda *_: made.append(0), score=lambda *_: next(scores))
+    trial = SimpleNamespace(model=lambda *_: made.append(0), score=lambda *_: next(scores), gain=0.0)
     monkeypatch.setattr("d2_plugin.runs.prior.trials._Trial.of", lambda *_: trial)
     trials = leave_out_in_turn(None, SimpleNamespace(train_cameras=TRAINED), NO_POINTS, None)
     assert len(made) == asked
@@ -149,7 +158,7 @@ def tried(monkeypatch: pytest.MonkeyPatch) -> list[RunSettings]:
 
     def told(settings: RunSettings, *_: object) -> Trials:
         made.append(settings)
-        return Trials({"a": BAD}, {"a": GOOD}, 1.0)
+        return Trials({"a": BAD}, {"a": GOOD}, 0.0, 1.0)
 
     monkeypatch.setattr("d2_plugin.runs.prior.trials.leave_out_in_turn", told)
     summary = PriorSummary(views={("a", 0): {"shares": {"verified": 1.0}, "sigmas": {}, "refused": None}})

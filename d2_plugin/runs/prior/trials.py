@@ -17,6 +17,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import numpy as np
@@ -52,7 +53,9 @@ MOST_LEFT_OUT = 2
 CLEAR = 0.02
 """A difference of SSIM at one left-out camera that needs no second one."""
 TIE = 0.005
-"""By how much stereo alone has to be ahead: what a network adds begins faint, and gains after a trial has ended."""
+"""A mean difference of SSIM below which it does not decide, but how good the maps are where stereo was left out."""
+GOOD_MAPS = 3.0
+"""Then they are used if depth is so many times as far off there without them."""
 
 
 @dataclass(frozen=True)
@@ -63,26 +66,31 @@ class Trials:
     """SSIM of the images of each left-out camera, where the others were trained with the whole prior."""
     stereo: Mapping[str, float]
     """The same with stereo alone."""
+    gain: float
+    """How many times as far off depth is without maps where stereo was left out, median of the views; 0: unknown."""
     cpu_seconds: float
 
     @property
     def choice(self) -> Belief:
-        """What predicts left-out cameras better, within `TIE` what knows more depth; stereo where both are the same."""
+        """What predicts left-out cameras better; within `TIE` the whole prior if maps are good, else stereo alone."""
         ahead = _mean(self.everything) - _mean(self.stereo)
-        return "all" if ahead > -TIE and ahead != 0 else "stereo"
+        better = ahead > 0 if abs(ahead) >= TIE else self.gain >= GOOD_MAPS
+        return "all" if better else "stereo"
 
     def __str__(self) -> str:
         with_it, without = _mean(self.everything), _mean(self.stereo)
-        verdict = "confirms stereo, which alone is used"
-        if self.choice == "all":
-            worth = "is worth inserting" if with_it > without else "changes little and fills what stereo leaves empty"
-            verdict = f"{worth}: the whole prior is used"
+        used = {"all": "is worth inserting: the whole prior is used", "stereo": "confirms stereo, which alone is used"}
+        verdict = used[self.choice]
+        if abs(with_it - without) < TIE:
+            off = f"{self.gain:.1f} times as far off" if self.gain else "not known how far off"
+            verdict += f", as depth is {off} without it where stereo was left out"
         return f"here monocular depth {verdict} (left-out cameras: SSIM {with_it:.3f} with it, {without:.3f} without)"
 
     def as_dict(self) -> dict[str, Any]:
         """For the table beside the prior and for metrics.json."""
         ssim = {"all": dict(self.everything), "stereo": dict(self.stereo)}
-        return {"choice": self.choice, "text": str(self), "cpu_seconds": self.cpu_seconds, "ssim": ssim}
+        about = {"text": str(self), "cpu_seconds": self.cpu_seconds, "gain": self.gain}
+        return {"choice": self.choice, "ssim": ssim} | about
 
 
 def _mean(ssim: Mapping[str, float]) -> float:
@@ -133,7 +141,7 @@ def leave_out_in_turn(settings: RunSettings, scene: Scene, points: TimedPoints, 
                 bar.update(sum(map(len, scores.values())), f"without camera {camera}: SSIM {ssim:.3f}")
             if abs(scores["all"][camera] - scores["stereo"][camera]) >= CLEAR:
                 break
-    return Trials(scores["all"], scores["stereo"], time.process_time() - begin)
+    return Trials(scores["all"], scores["stereo"], trial.gain, time.process_time() - begin)
 
 
 def left_out(cameras: Sequence[str]) -> tuple[str, ...]:
@@ -150,6 +158,7 @@ class _Trial:
     scene: Scene
     points: TimedPoints
     store: Store
+    gain: float
 
     @classmethod
     def of(cls, settings: RunSettings, scene: Scene, points: TimedPoints, store: PriorStore) -> _Trial:
@@ -166,7 +175,10 @@ class _Trial:
             downscale=settings.downscale * factor,
         )
         scene = replace(scene.with_points(points, settings), recording=recording, test_cameras=())
-        return cls(replace(settings, iterations=STEPS), scene, points, SmallStore(store, factor))
+        records = [store.record(camera, frame) or {} for camera in cameras for frame in frames]
+        gains = [skill["gain"] for record in records if (skill := record.get("skill")) and skill["gain"]]
+        small = SmallStore(store, factor)
+        return cls(replace(settings, iterations=STEPS), scene, points, small, median(gains or [0.0]))
 
     def model(self, cameras: Sequence[str], belief: Belief) -> Any:
         """A model that some of the cameras trained, begun on their stereo as a run is, in too few steps to gather the
