@@ -84,7 +84,7 @@ def test_in_a_tie_the_maps_are_used_where_they_are_good(ahead: float, gain: floa
     """*studio* with every second instant, and *dome* 02 07 22: level in trials, not after 2000 steps."""
     trials = Trials({"a": GOOD + ahead}, {"a": GOOD}, gain, 1.0)
     assert trials.choice == choice
-    assert ("times as far off without it where stereo was left out" in str(trials)) == (abs(ahead) < 0.005)
+    assert ("trials are level, and depth is" in str(trials)) == (abs(ahead) < 0.005)
 
 
 @pytest.mark.parametrize(("ahead", "asked"), [(0.015, 4), (0.025, 2)])

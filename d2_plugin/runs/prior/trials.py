@@ -82,8 +82,8 @@ class Trials:
         used = {"all": "is worth inserting: the whole prior is used", "stereo": "confirms stereo, which alone is used"}
         verdict = used[self.choice]
         if abs(with_it - without) < TIE:
-            off = f"{self.gain:.1f} times as far off" if self.gain else "not known how far off"
-            verdict += f", as depth is {off} without it where stereo was left out"
+            known = f"depth is {self.gain:.1f} times as far off without it where stereo was left out"
+            verdict += f": trials are level, and {known if self.gain else 'too little stereo to leave out tells no more'}"
         return f"here monocular depth {verdict} (left-out cameras: SSIM {with_it:.3f} with it, {without:.3f} without)"
 
     def as_dict(self) -> dict[str, Any]:
