@@ -83,7 +83,8 @@ class Trials:
         verdict = used[self.choice]
         if abs(with_it - without) < TIE:
             known = f"depth is {self.gain:.1f} times as far off without it where stereo was left out"
-            verdict += f": trials are level, and {known if self.gain else 'too little stereo to leave out tells no more'}"
+            unknown = "there is too little stereo to leave some out"
+            verdict += f": trials are level, and {known if self.gain else unknown}"
         return f"here monocular depth {verdict} (left-out cameras: SSIM {with_it:.3f} with it, {without:.3f} without)"
 
     def as_dict(self) -> dict[str, Any]:
