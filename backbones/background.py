@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
-from dataclasses import replace
 from typing import Any
 
 import torch
@@ -38,6 +37,8 @@ UNSEEN = 0.3
 Colours of a sky or of a wall that are learnt beside it would else go on to there."""
 DIRECTIONS = 4000
 """At how many of them that is known."""
+INFINITY = 1e9
+"""So far away that it does not matter where a camera stands, world units."""
 KEPT_CAMERAS = 256
 """Cameras whose harmonics are kept."""
 
@@ -61,7 +62,7 @@ class Background:
         """Begin with what the images show in each direction, as if all of it were at infinity.
 
         Least squares over the nodes of at most `STARTING_IMAGES` views, spread evenly. A ridge that grows with the
-        degree keeps directions that no camera sees near the mean colour.
+        degree keeps directions that no camera sees near the mean colour, and `optimize` pulls them back to it.
 
         Args:
             images: the image [H, W, 3] in 0..1 of each, by its index in `views`.
@@ -79,7 +80,8 @@ class Background:
         self.harmonics.copy_(solved[1:])
         self.first.copy_(solved)
         around = _around(DIRECTIONS).to(values.device)
-        unseen = basis(around[~torch.stack([_looks(views[index], around) for index in chosen]).any(0)], DEGREE)
+        seen_from = torch.stack([views[index].sees(INFINITY * around) for index in chosen])
+        unseen = basis(around[~seen_from.any(0)], DEGREE)
         self.unseen.copy_(unseen.T @ unseen / DIRECTIONS)
 
     def behind(self, render: Render, view: View, change: Tensor | None = None) -> Render:
@@ -189,10 +191,3 @@ def _around(count: int) -> Tensor:
     index = torch.arange(count, dtype=torch.float64) + 0.5
     z, turn = 1 - 2 * index / count, math.pi * (1 + math.sqrt(5)) * index
     return torch.stack([(1 - z * z).sqrt() * turn.cos(), (1 - z * z).sqrt() * turn.sin(), z], -1)
-
-
-def _looks(view: View, directions: Tensor) -> Tensor:
-    """In which directions [K, 3] of the world a view looks, bool [K]."""
-    pose = view.T_camera_world.clone()
-    pose[:3, 3] = 0
-    return replace(view, T_camera_world=pose).sees(directions)
