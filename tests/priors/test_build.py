@@ -271,7 +271,7 @@ def test_a_network_is_asked_once_per_image(plain: Recording, begun: Path, tmp_pa
 
 
 def test_mistakes_are_told_before_anything_is_written(plain: Recording, tmp_path: Path) -> None:
-    wrong = {"unknown camera 'cam7'": ["train0", "cam7"], "name at least one": [], "contain a duplicate": ["train0"] * 2}
+    wrong = {"unknown camera 'cam7'": ["train0", "cam7"], "name at least one": [], "a duplicate": ["train0"] * 2}
     for message, names in wrong.items():
         refuses(message, build_priors, plain, names, tmp_path / "p", SETTINGS)
     refuses("declared relative", build_priors, plain, NAMES, tmp_path / "p", replace(SETTINGS, mono_kind="metric"))
