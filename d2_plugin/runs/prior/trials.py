@@ -4,7 +4,8 @@ A declared error, however honest, does not say whether a depth helps cameras tha
 on what would stand there without it. A training camera shows it as long as it is left out: the others are trained for
 a moment on small images, once with the whole prior and once with its stereo alone, and what the left-out camera would
 see is compared with its images. Where the first one does not decide clearly a second one is left out. SSIM decides:
-single floaters and colours that cameras see differently weigh less in it than in PSNR.
+single floaters and colours that cameras see differently weigh less in it than in PSNR. Where that is level, maps are
+used if they are good where stereo was left out of their alignment.
 
 The prior is the run's own, so a trial costs its training and no more. Stereo of the left-out camera's images is in it,
 for both beliefs alike.
