@@ -37,7 +37,7 @@ UNSEEN = 0.3
 Colours of a sky or of a wall that are learnt beside it would else go on to there."""
 DIRECTIONS = 4000
 """At how many of them that is known."""
-INFINITY = 1e9
+FAR_AWAY = 1e9
 """So far away that it does not matter where a camera stands, world units."""
 KEPT_CAMERAS = 256
 """Cameras whose harmonics are kept."""
@@ -79,8 +79,8 @@ class Background:
         self.constant.copy_(solved[:1])
         self.harmonics.copy_(solved[1:])
         self.first.copy_(solved)
-        around = _around(DIRECTIONS).to(values.device)
-        seen_from = torch.stack([views[index].sees(INFINITY * around) for index in chosen])
+        around = _fibonacci_sphere(DIRECTIONS).to(values.device)
+        seen_from = torch.stack([views[index].sees(FAR_AWAY * around) for index in chosen])
         unseen = basis(around[~seen_from.any(0)], DEGREE)
         self.unseen.copy_(unseen.T @ unseen / DIRECTIONS)
 
@@ -186,8 +186,8 @@ def _directions(view: View) -> Tensor:
     return rays / rays.norm(dim=-1, keepdim=True)
 
 
-def _around(count: int) -> Tensor:
-    """Unit directions [count, 3], float64, evenly spread over all: a spiral from pole to pole."""
+def _fibonacci_sphere(count: int) -> Tensor:
+    """Unit directions [count, 3], float64, evenly spread over all."""
     index = torch.arange(count, dtype=torch.float64) + 0.5
     z, turn = 1 - 2 * index / count, math.pi * (1 + math.sqrt(5)) * index
     return torch.stack([(1 - z * z).sqrt() * turn.cos(), (1 - z * z).sqrt() * turn.sin(), z], -1)

@@ -29,8 +29,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from d2_plugin.cache import cache_folder, cache_lock, check_private, is_trusted, private_cache
+from d2_plugin.compiler.prebuilt import digest_of
 from d2_plugin.compiler.prebuilt import find as find_prebuilt
-from d2_plugin.compiler.prebuilt import hash_of
 from d2_plugin.durable import write_text
 from d2_plugin.errors import D2Error
 
@@ -110,7 +110,7 @@ def load_library(
     user = _words("D2_CXXFLAGS", os.environ.get("D2_CXXFLAGS", ""))
     command = [*compiler, *BASE_FLAGS, *_native_flags(tuple(compiler)), *flags, *includes, *user]
     words = [*BASE_FLAGS, *flags, os.environ.get("D2_CXXFLAGS", ""), _predefined(tuple(command))]
-    key = hash_of(words, (*sources, *headers))
+    key = digest_of(words, (*sources, *headers))
     library = cache_folder() / f"{name}-{key}.so"
     with _guard:
         if library not in _loaded:

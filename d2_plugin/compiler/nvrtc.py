@@ -22,7 +22,7 @@ import torch
 
 from d2_plugin.cache import cache_folder, check_private, is_trusted, private_cache
 from d2_plugin.compiler import CompileError
-from d2_plugin.compiler.prebuilt import hash_of
+from d2_plugin.compiler.prebuilt import digest_of
 from d2_plugin.errors import D2Error
 
 logger = logging.getLogger(__name__)
@@ -139,7 +139,7 @@ def build(name: str, code: Program, flags: Sequence[str], capability: int) -> Bi
     """
     compiler = library()
     architecture = compiler.architecture_for(capability)
-    key = hash_of([repr((tuple(flags), architecture, compiler.version))], (code.source, *code.headers))
+    key = digest_of([repr((tuple(flags), architecture, compiler.version))], (code.source, *code.headers))
     entry = cache_folder() / f"{name}-{architecture}-{key}.cubin"
     if (binary := _read_entry(entry)) is None:
         start = time.perf_counter()

@@ -49,10 +49,10 @@ LEVELS = {
 
 def file_name(name: str, level: str, sources: Sequence[Path], headers: Sequence[Path], flags: Sequence[str]) -> str:
     """What a compiled library is called: its sources, headers and flags are part of the name."""
-    return f"{name}-{hash_of(flags, (*sources, *headers))}-{level}.so"
+    return f"{name}-{digest_of(flags, (*sources, *headers))}-{level}.so"
 
 
-def hash_of(words: Sequence[str], files: Sequence[Path]) -> str:
+def digest_of(words: Sequence[str], files: Sequence[Path]) -> str:
     """Twenty letters that stand for words and for what is in files."""
     digest = hashlib.sha256("\0".join(words).encode())
     for path in files:

@@ -10,7 +10,7 @@ PAIRS = 1 << 22
 
 
 def nearest(points: Tensor, queries: Tensor, k: int) -> tuple[Tensor, Tensor]:
-    """Distances and indices [M, k] of the points [N, D] nearest to each query [M, D], the nearest first.
+    """Distances and indices [M, k] of the k <= N points [N, D] nearest to each query [M, D], the nearest first.
 
     From differences: `cdist` by itself multiplies matrices, and far from the origin loses what lies close together.
     """

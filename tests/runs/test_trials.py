@@ -67,7 +67,9 @@ def test_ssim_at_left_out_cameras_decides_and_one_line_says_so() -> None:
 
 def test_where_a_network_adds_nothing_stereo_alone_is_used() -> None:
     """Both are the same training then: what is simpler is said."""
-    assert Trials({"a": GOOD}, {"a": GOOD}, 0.0, 1.0).choice == "stereo"
+    same = Trials({"a": GOOD}, {"a": GOOD}, 0.0, 1.0)
+    assert same.choice == "stereo"
+    assert "trials are level, and there is too little stereo to leave some out" in str(same)
 
 
 @pytest.mark.parametrize(
@@ -120,7 +122,8 @@ def stored(folder: Path, recording: Recording, wrong: float) -> Path:
             labels = np.where(verified, Label.VERIFIED, Label.MONO).astype(np.uint8)
             sigma = np.where(verified, 0.003, 0.1).astype(np.float32)
             prior = FusedPrior((truth * off).astype(np.float32), labels, sigma, recording.image(camera, frame))
-            made.write(camera, frame, prior, {"key": "k", "shares": prior.shares()})
+            skill = {"error": 0.1, "gain": 2.0 + number}
+            made.write(camera, frame, prior, {"key": "k", "shares": prior.shares(), "skill": skill})
     return folder
 
 
@@ -132,6 +135,7 @@ def test_depth_is_believed_if_it_is_right_whatever_its_sigma(room, tmp_path, wro
     store = PriorStore.open(stored(tmp_path / "priors", scene.recording, wrong))
     trials = leave_out_in_turn(settings, scene, NO_POINTS, store)
     assert trials.choice == choice
+    assert trials.gain == 3.0, "the median of the views"
 
 
 def test_a_trial_begins_on_stereo_of_the_cameras_that_train_it_and_of_no_other(room, tmp_path, monkeypatch) -> None:
