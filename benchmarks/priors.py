@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
+import numpy as np
 import torch
 
 from benchmarks.priors_motion import motion_errors
@@ -22,13 +23,7 @@ from benchmarks.rows import begin_rows, told
 from benchmarks.stereo_rigs import ARCS, RENDERED
 from d2_plugin.errors import D2Error, refuse_unknown
 from d2_plugin.priors.build import build_priors
-from d2_plugin.priors.declared_error import (
-    NORMAL_SHARE,
-    DeclaredErrors,
-    frames_with_truth,
-    held_against_truth,
-    label_name,
-)
+from d2_plugin.priors.declared_error import DeclaredErrors, frames_with_truth, held_against_truth, label_name
 from d2_plugin.priors.settings import PriorSettings
 from d2_plugin.recordings import Recording, open_recording
 from d2_plugin.recordings.synthetic.room import synthetic_recording
@@ -40,6 +35,23 @@ from d2_plugin.store.store import PriorStore
 logger = logging.getLogger(__name__)
 
 RENDERED_FRAMES = 24
+
+NORMAL_SHARE = 0.6827
+"""Share of normal errors that lie within one standard deviation."""
+BINS_PER_DECADE = 4
+"""Bins of the curve: the declared sigma within one differs by a factor of 1.8 at most."""
+LEAST_SHARE, LEAST_PIXELS = 0.01, 30
+"""A bin counts where it holds this share of the label's pixels, and this many: fewer say nothing about a quantile."""
+
+
+class CurvePoint(NamedTuple):
+    """One bin of the reliability curve; on the diagonal, error = sigma, it is honest."""
+
+    sigma: float
+    """Median declared sigma of the bin."""
+    error: float
+    """What `NORMAL_SHARE` of |log(D / true)| in the bin lies within."""
+    pixels: int
 
 
 @dataclass(frozen=True)
@@ -167,10 +179,30 @@ def rows_of(case: Case, found: DeclaredErrors, seconds: float, command: str = ""
             within_two=held.within_two,
             median_sigma=held.sigma,
             median_error=held.error,
-            curve=[list(point) for point in held.curve],
+            curve=[list(point) for point in reliability_curve(*held.pairs)],
             **about,
         )
         for label, held in found.labels.items()
     ]
     far: dict[str, Any] = {"sky_found": found.sky_found, "false_far": found.false_far}
     return [*rows, make_row("priors", case.name, "far", error=found.false_far, **far, **about)]
+
+
+def reliability_curve(error: np.ndarray, sigma: np.ndarray) -> tuple[CurvePoint, ...]:
+    """True against declared error in logarithmic bins of the declared one; the bins' edges are 10^(k / 4).
+
+    Args:
+        error: |log(D / true)| [K].
+        sigma: declared relative standard deviation [K]. A sigma of 0 has no place on a logarithmic axis.
+
+    Returns:
+        The bins that hold pixels enough, by ascending sigma.
+    """
+    error, sigma = error[sigma > 0], sigma[sigma > 0]
+    bins = np.floor(BINS_PER_DECADE * np.log10(sigma)).astype(int)
+    least = max(LEAST_PIXELS, LEAST_SHARE * sigma.size)
+    inside = [bins == place for place, pixels in zip(*np.unique(bins, return_counts=True)) if pixels >= least]
+    return tuple(
+        CurvePoint(float(np.median(sigma[mask])), float(np.quantile(error[mask], NORMAL_SHARE)), int(mask.sum()))
+        for mask in inside
+    )

@@ -7,8 +7,7 @@ A normal error lies within sigma at 68 % and within 2 sigma at 95 % of the pixel
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -20,31 +19,14 @@ from d2_plugin.store.store import PriorStore
 DECLARED = (Label.VERIFIED, Label.AGREED, Label.MONO)
 """Labels whose sigma is held against the truth; far pixels claim only a lower bound of depth."""
 
-NORMAL_SHARE = 0.6827
-"""Share of normal errors that lie within one standard deviation."""
-BINS_PER_DECADE = 4
-"""Bins of the curve: the declared sigma within one differs by a factor of 1.8 at most."""
-LEAST_SHARE, LEAST_PIXELS = 0.01, 30
-"""A bin counts where it holds this share of the label's pixels, and this many: fewer say nothing about a quantile."""
-
 LEAST_VALUES, COME_BACK, NEARLY_WHOLE = 20, 30, 0.05
 """A true depth map is rounded where it has this many values, each comes back so many times, and so near to whole steps
 lie between nearly all of them."""
 
 
-class CurvePoint(NamedTuple):
-    """One bin of the reliability curve; on the diagonal, error = sigma, it is honest."""
-
-    sigma: float
-    """Median declared sigma of the bin."""
-    error: float
-    """What `NORMAL_SHARE` of |log(D / true)| in the bin lies within."""
-    pixels: int
-
-
 @dataclass(frozen=True)
 class LabelErrors:
-    """How the pixels of one label compare with the truth; shares are NaN where there are no such pixels."""
+    """How the pixels of one label compare with the truth."""
 
     pixels: int
     """Pixels with this label at which the true depth is known and sigma is finite."""
@@ -58,8 +40,8 @@ class LabelErrors:
     """Median declared sigma."""
     error: float
     """Median of |log(D / true)|."""
-    curve: tuple[CurvePoint, ...] = ()
-    """True against declared error by bins of the declared one, ascending; see `reliability_curve`."""
+    pairs: np.ndarray = field(repr=False, compare=False)
+    """|log(D / true)| and sigma of each pixel [2, K]."""
 
 
 @dataclass(frozen=True)
@@ -126,10 +108,10 @@ def held_against_truth(
                 pairs.append(np.stack([error, np.hypot(sigma[mask], rounding[mask])]))
     if not views:
         return None
-    by_label = {label: _label_errors(np.concatenate(pairs, axis=1), pixels) for label, pairs in collected.items()}
+    by_label = {label: np.concatenate(pairs, axis=1) for label, pairs in collected.items()}
     return DeclaredErrors(
         views,
-        {label: errors for label, errors in by_label.items() if errors.pixels},
+        {label: _label_errors(pairs, pixels) for label, pairs in by_label.items() if pairs.size},
         sky_far / sky if sky else float("nan"),
         surface_far / max(pixels - sky, 1),
     )
@@ -154,35 +136,12 @@ def truth_rounding(truth: np.ndarray) -> np.ndarray:
     return rounding
 
 
-def reliability_curve(error: np.ndarray, sigma: np.ndarray) -> tuple[CurvePoint, ...]:
-    """True against declared error in logarithmic bins of the declared one; the bins' edges are 10^(k / 4).
-
-    Args:
-        error: |log(D / true)| [K].
-        sigma: declared relative standard deviation [K]. A sigma of 0 has no place on a logarithmic axis.
-
-    Returns:
-        The bins that hold pixels enough, by ascending sigma.
-    """
-    error, sigma = error[sigma > 0], sigma[sigma > 0]
-    bins = np.floor(BINS_PER_DECADE * np.log10(sigma)).astype(int)
-    least = max(LEAST_PIXELS, LEAST_SHARE * sigma.size)
-    inside = [bins == place for place, pixels in zip(*np.unique(bins, return_counts=True)) if pixels >= least]
-    return tuple(
-        CurvePoint(float(np.median(sigma[mask])), float(np.quantile(error[mask], NORMAL_SHARE)), int(mask.sum()))
-        for mask in inside
-    )
-
-
 def _label_errors(pairs: np.ndarray, pixels: int) -> LabelErrors:
     """Of errors and sigmas [2, K] of one label, out of so many `pixels` in all."""
     error, sigma = pairs
-    if not error.size:
-        unknown = float("nan")
-        return LabelErrors(0, 0.0, unknown, unknown, unknown, unknown)
     within, within_two = (float((error <= times * sigma).mean()) for times in (1, 2))
-    medians, curve = (float(np.median(sigma)), float(np.median(error))), reliability_curve(error, sigma)
-    return LabelErrors(error.size, error.size / pixels, within, within_two, *medians, curve)
+    medians = float(np.median(sigma)), float(np.median(error))
+    return LabelErrors(error.size, error.size / pixels, within, within_two, *medians, pairs)
 
 
 def label_name(label: Label) -> str:

@@ -14,7 +14,7 @@ from benchmarks.__main__ import PARTS, main
 from benchmarks.align_measure import TRUE_LINE, AlignMethod, align_problem, methods
 from benchmarks.gpu import proof as gpu
 from benchmarks.never_worse.maps import SPOILED, Spoiled, spoiled_recording
-from benchmarks.priors import PriorsBench
+from benchmarks.priors import NORMAL_SHARE, PriorsBench, reliability_curve
 from benchmarks.priors import run as run_priors
 from benchmarks.priors_section import priors
 from benchmarks.report import EVERY
@@ -22,7 +22,7 @@ from benchmarks.stability.sweep import run_sweeps
 from benchmarks.stereo_measure import score
 from benchmarks.work_precision import means, work_precision
 from d2_plugin.commands.cli import main as d2
-from d2_plugin.priors.declared_error import NORMAL_SHARE, frames_with_truth, reliability_curve
+from d2_plugin.priors.declared_error import frames_with_truth
 from d2_plugin.priors.settings import PriorSettings
 from d2_plugin.recordings import open_recording
 from d2_plugin.recordings.synthetic.room import synthetic_recording
