@@ -9,10 +9,10 @@ view in degrees.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple, Optional
+from typing import Annotated, NamedTuple, Optional
 
 import numpy as np
 
@@ -29,6 +29,7 @@ from d2_plugin.recordings.cameras.camera import (
     rigid,
     unit,
 )
+from d2_plugin.recordings.cameras.formats.document import numbers
 from d2_plugin.recordings.cameras.rotations import quaternion_of_rotation, rotation_of_quaternion, rotation_of_vector
 from d2_plugin.values import Range
 
@@ -200,9 +201,9 @@ def read_camera_path(path: Path) -> CameraPath:
     cameras, times = [], []
     for number, entry in enumerate(entries):
         where = f"camera {number} of {path}"
-        if not isinstance(entry, Mapping):
+        if not isinstance(entry, dict):
             raise D2Error(f"{where} is no object: {EXPORT}")
-        T_world_camera = _pose(entry, where)
+        T_world_camera = numbers(entry, "camera_to_world", (4, 4), where, EXPORT)
         focal = size[1] / 2 / np.tan(np.radians(field(entry, "fov", Vertical, where, EXPORT)) / 2)
         R = T_world_camera[:3, :3].T  # whether it is a rotation is checked of the camera that comes of it
         pose = OPENGL_TO_OPENCV @ rigid(R, -R @ T_world_camera[:3, 3])
@@ -226,17 +227,3 @@ def camera_path_text(cameras: Sequence[Camera], shares: Sequence[float], fps: fl
         entries.append({"camera_to_world": world.flatten().tolist(), "fov": fov, "render_time": share})
     size = {"render_width": cameras[0].width, "render_height": cameras[0].height} if cameras else {}
     return json_text(size | {"fps": fps, "seconds": len(entries) / fps, "camera_path": entries}, "the camera path")
-
-
-def _pose(entry: Mapping[str, Any], place: str) -> np.ndarray:
-    """`camera_to_world` of an entry, [4, 4], nested or not."""
-    values = field(entry, "camera_to_world", list, place, EXPORT)
-    try:
-        matrix = np.array(values, np.float64).reshape(4, 4)
-    except (TypeError, ValueError, OverflowError):
-        raise D2Error(f"camera_to_world of {place} is no matrix of 4 x 4 numbers: {EXPORT}") from None
-    if not (np.abs(matrix) <= LARGEST_NUMBER).all():
-        raise D2Error(f"camera_to_world of {place} has a number that is not finite or too large: {EXPORT}")
-    if not np.array_equal(matrix[3], (0, 0, 0, 1)):
-        raise D2Error(f"camera_to_world of {place} ends in {matrix[3].tolist()}, expected 0, 0, 0, 1: {EXPORT}")
-    return matrix

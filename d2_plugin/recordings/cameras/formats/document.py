@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any
@@ -110,9 +109,9 @@ def object_of(entry: Any, what: str) -> Table:
     return entry
 
 
-def numbers(table: Mapping[str, Any], key: str, shape: tuple[int, ...], place: str) -> np.ndarray:
+def numbers(table: Table, key: str, shape: tuple[int, ...], place: str, remedy: str = CORRECT) -> np.ndarray:
     """The array under `key`, float64 [*shape], nested in lists or not; -1 in `shape` stands for any length."""
-    value = field(table, key, list, place, CORRECT)
+    value = field(table, key, list, place, remedy)
     try:
         array = np.array(value, np.float64)
     except (TypeError, ValueError, OverflowError) as failure:
@@ -120,16 +119,16 @@ def numbers(table: Mapping[str, Any], key: str, shape: tuple[int, ...], place: s
     if -1 not in shape and array.size != np.prod(shape):
         raise D2Error(
             f"{key} of {place} cannot be understood: it is {shown(value)}, expected "
-            f"{' x '.join(map(str, shape))} numbers: {CORRECT}"
+            f"{' x '.join(map(str, shape))} numbers: {remedy}"
         )
     if not (np.abs(array) <= LARGEST_NUMBER).all():
-        raise D2Error(f"{key} of {place} has a number that is not finite or too large: {CORRECT}")
+        raise D2Error(f"{key} of {place} has a number that is not finite or too large: {remedy}")
     if shape == (4, 4) and not np.allclose(last := array.ravel()[12:], [0, 0, 0, 1]):
-        raise D2Error(f"{key} of {place} ends with the row {last.tolist()}, expected 0 0 0 1: {CORRECT}")
+        raise D2Error(f"{key} of {place} ends with the row {last.tolist()}, expected 0 0 0 1: {remedy}")
     return array.reshape(shape)
 
 
-def matrix_of(table: Mapping[str, Any], key: str, shape: tuple[int, ...], where: str) -> np.ndarray:
+def matrix_of(table: Table, key: str, shape: tuple[int, ...], where: str) -> np.ndarray:
     """A matrix of OpenCV's FileStorage, [*shape]: a row serves as well as a column."""
     entry = table.get(key)
     if not isinstance(entry, dict) or not isinstance(entry.get("data"), list):
@@ -137,12 +136,12 @@ def matrix_of(table: Mapping[str, Any], key: str, shape: tuple[int, ...], where:
     return numbers(entry, "data", shape, f"{key} in {where}")
 
 
-def coefficients(table: Mapping[str, Any], key: str, place: str) -> np.ndarray:
+def coefficients(table: Table, key: str, place: str) -> np.ndarray:
     """The distortion under `key`, [n]; none where the file has none."""
     return numbers(table, key, (-1,), place) if key in table else np.zeros(0)
 
 
-def size_of(table: Mapping[str, Any], key: str, place: str) -> tuple[int, int]:
+def size_of(table: Table, key: str, place: str) -> tuple[int, int]:
     """(width, height) under `key`; some tools write whole numbers with a decimal point."""
     width, height = numbers(table, key, (2,), place)
     if width != round(width) or height != round(height) or min(width, height) < 1:
