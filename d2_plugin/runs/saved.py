@@ -31,19 +31,6 @@ RUN = durable.Kind("table of settings", 1, "run `d2 train` with another --output
 METRICS = durable.Kind("table of scores", 1, "run `d2 eval` on that folder")
 """metrics.json."""
 
-SHAPE: dict[str, tuple[type, ...]] = {
-    "test": (dict, type(None)),
-    "seconds": (dict,),
-    "gaussians": (int,),
-    "iterations": (int,),
-    "recording": (str,),
-    "train_cameras": (list,),
-    "backbone": (str,),
-    "hooks": (list,),
-    "made": (dict,),
-}
-"""What every table of scores holds."""
-
 
 def read_run(folder: Path) -> dict[str, Any]:
     """The run.json of a run folder.
@@ -63,15 +50,10 @@ def read_metrics(folder: Path) -> dict[str, Any]:
     Raises:
         D2Error: there is none, it is damaged, or that of another version.
     """
-    path = folder / "metrics.json"
     try:
-        table = durable.read_table(path, METRICS)
+        return durable.read_table(folder / "metrics.json", METRICS)
     except FileNotFoundError:
         raise D2Error(f"{folder} has no metrics.json: finish `d2 train` there, or run `d2 eval`") from None
-    missing = [name for name, kinds in SHAPE.items() if name not in table or not isinstance(table[name], kinds)]
-    if missing:
-        raise durable.Damaged(f"the {METRICS.name} {path} is damaged (no {', '.join(missing)} in it): {METRICS.remedy}")
-    return table
 
 
 def claim(folder: Path, identity: Mapping[str, Any]) -> None:
