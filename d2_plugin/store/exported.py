@@ -60,16 +60,10 @@ class RenamedStore:
         """The same as it is stored, where the store has that."""
         return self._of_source("coded" if hasattr(self.store, "coded") else "prior", camera, frame)
 
-    def underway(self, camera: str, frame: int, quarter: int) -> tuple[int, DepthPrior] | None:
-        """See `PriorStore.underway`; None where the export leaves out the next frame."""
-        return self._next_exported(self._of_source("underway", camera, frame, quarter))
-
     def coded_underway(self, camera: str, frame: int, quarter: int) -> Any:
-        """The same as it is stored, where the store has that."""
+        """See `PriorStore.coded_underway`, not coded if the store has none; None if the next frame is not exported."""
         name = "coded_underway" if hasattr(self.store, "coded_underway") else "underway"
-        return self._next_exported(self._of_source(name, camera, frame, quarter))
-
-    def _next_exported(self, underway: Any) -> Any:
+        underway = self._of_source(name, camera, frame, quarter)
         exported = {source: number for number, source in self.frames.items()}
         return (exported[underway[0]], underway[1]) if underway is not None and underway[0] in exported else None
 

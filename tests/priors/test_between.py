@@ -215,10 +215,10 @@ class TestHalfway:
 
     def test_an_export_has_it_under_its_own_names(self, flown: PriorStore) -> None:
         renamed = RenamedStore(flown, {"a": "cam0"}, {10: 1, 11: 2})
-        following, halfway = renamed.underway("a", 10, 2)
+        following, halfway = renamed.coded_underway("a", 10, 2)
         assert following == 11
-        assert torch.equal(halfway.colors, flown.underway("cam0", 1, 2)[1].colors)
-        assert renamed.underway("a", 11, 2) is None  # frame 3 was not exported
+        assert torch.equal(halfway.decoded().colors, flown.underway("cam0", 1, 2)[1].colors)
+        assert renamed.coded_underway("a", 11, 2) is None  # frame 3 was not exported
 
     def test_the_contact_sheet_shows_it_below_the_priors(self, flown: PriorStore, tmp_path: Path) -> None:
         recording = SimpleNamespace(frames=flown.frames, image=lambda camera, frame: shown(ball(*way(frame))))
