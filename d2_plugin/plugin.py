@@ -33,7 +33,6 @@ from d2_plugin.hooks.expected import (
     check_step,
     check_surroundings,
     converted,
-    fitting_state,
     small_image,
 )
 from d2_plugin.hooks.finite import FiniteCheck
@@ -41,7 +40,7 @@ from d2_plugin.hooks.prior import Store
 from d2_plugin.hooks.reports import OnReport, Report, RunLog, ScalarWriter, Trace
 from d2_plugin.hooks.views import ViewSampler
 from d2_plugin.protocol import Backbone, Edit, Points, View, call_optional, schedule_step
-from d2_plugin.reading import said
+from d2_plugin.reading import parsing, said
 from d2_plugin.registry import ADAPTERS, load
 from d2_plugin.values import checked_arguments, fitting
 
@@ -255,8 +254,8 @@ class D2Hooks:
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from `state_dict()`, once the backbone is restored; refuses the state of other hooks than these."""
-        check_state(state, self.hooks, len(self.backbone))
-        with fitting_state():
+        with parsing("the state of D2", "give what d2.state_dict() returned, of this version"):
+            check_state(state, self.hooks, len(self.backbone))
             for name, hook in self.hooks.items():
                 hook.load_state_dict(state["hooks"][name])
             self._sampler.load_state_dict(state["views"])

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import logging
 import operator
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -15,7 +14,6 @@ from torch import Tensor
 
 from d2_plugin.errors import D2Error
 from d2_plugin.protocol import Backbone, DepthPrior, Label, Splats, View, call_optional
-from d2_plugin.reading import said
 from d2_plugin.values import fitting, shown
 
 _log = logging.getLogger(__name__)
@@ -239,41 +237,21 @@ def check_step(step: object) -> None:
         raise D2Error(f"d2 got {shown(step)} as the step: give the number of the optimizer's step, 0 or more")
 
 
-@contextmanager
-def fitting_state() -> Iterator[None]:
-    """Within it, a state that does not fit is one sentence."""
-    try:
-        yield
-    except D2Error:
-        raise
-    except (AttributeError, IndexError, KeyError, RuntimeError, TypeError, ValueError) as failure:
-        raise D2Error(
-            f"the state of D2 does not fit ({said(failure)}): give what d2.state_dict() returned, of this version"
-        ) from failure
-
-
-def check_state(state: object, hooks: Mapping[str, Any], count: int) -> None:
+def check_state(state: Mapping[str, Any], hooks: Mapping[str, Any], count: int) -> None:
     """Refuse a state that `state_dict` did not give, one of other hooks, or one of another number of Gaussians."""
-    lacks = [name for name in STATE if not isinstance(state, Mapping) or name not in state]
-    if lacks or not isinstance(state, Mapping):
+    lacks = [name for name in STATE if name not in state]
+    if lacks:
         raise D2Error(f"the state of D2 has no {', '.join(lacks)}: give what d2.state_dict() returned")
-    saved = state["hooks"]
-    if not isinstance(saved, Mapping) or set(saved) != set(hooks):
-        names = sorted(saved) if isinstance(saved, Mapping) else shown(saved)
+    saved: Mapping[str, Mapping[str, Any]] = state["hooks"]
+    if saved.keys() != hooks.keys():
         raise D2Error(
-            f"the checkpoint was made with hooks {names or 'none'} but this run has {sorted(hooks) or 'none'}: "
+            f"the checkpoint was made with hooks {sorted(saved) or 'none'} but this run has {sorted(hooks) or 'none'}: "
             "resume with the same hooks"
         )
-    of_hooks = [(name, *entry) for name, tensors in saved.items() for entry in _entries(name, tensors)]
+    of_hooks = [(name, *entry) for name, tensors in saved.items() for entry in tensors.items()]
     for name, what, tensor in [*of_hooks, ("d2", "inserted_at", state.get("inserted_at"))]:
         if isinstance(tensor, Tensor) and tensor.ndim > 0 and len(tensor) != count:
             raise D2Error(
                 f"{what} of {name} in the checkpoint is of {len(tensor)} Gaussians but the backbone has {count}: "
                 "restore the backbone from the same checkpoint before d2"
             )
-
-
-def _entries(name: str, tensors: object) -> list[tuple[str, Any]]:
-    if not isinstance(tensors, Mapping):
-        raise D2Error(f"the state of D2 has {shown(tensors)} for {name}: give what d2.state_dict() returned")
-    return list(tensors.items())

@@ -19,6 +19,7 @@ from d2_plugin.plugin import D2Hooks
 from d2_plugin.priors.frame import view_digest
 from d2_plugin.priors.summary import PriorSummary
 from d2_plugin.progress import progress_bar
+from d2_plugin.reading import parsing
 from d2_plugin.runs import saved
 from d2_plugin.runs.prior.build import build_priors_for, refuse_unusable
 from d2_plugin.runs.prior.trials import LEAST_ITERATIONS, can_decide, tried
@@ -223,7 +224,7 @@ class Run:
         state = saved.load_checkpoint(self._checkpoint, self.settings.device)
         if state is None:
             return False
-        with saved.fitting(self._checkpoint):
+        with parsing(f"the checkpoint {self._checkpoint}", saved.REMEDY):
             self.retired = dict(state["d2"]["retired"]) if state["d2"] else {}
             if trainer.d2 is None:
                 state["d2"] = None

@@ -7,7 +7,6 @@ form and a checksum of all its bytes, which are compared before torch sees them.
 from __future__ import annotations
 
 import io
-import pickle
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -22,6 +21,7 @@ from d2_plugin.gaussians.trained import trained_tensors
 from d2_plugin.hooks import finite
 from d2_plugin.hooks.finite import Diverged
 from d2_plugin.locks import only_writer
+from d2_plugin.reading import parsing
 from d2_plugin.runs.settings import RunSettings
 from d2_plugin.values import shown
 
@@ -86,10 +86,7 @@ def _refuse_another(folder: Path, identity: Mapping[str, Any]) -> None:
 CHECKPOINT_FORMAT = 1
 """Raise it when a checkpoint gets another form."""
 
-MISFITS = (RuntimeError, KeyError, TypeError, AttributeError, IndexError, ValueError, EOFError, pickle.UnpicklingError)
-"""What torch and the models raise for a state that is not theirs."""
-
-_REMEDY = "remove the file to train from the start, or put a copy of it back"
+REMEDY = "remove the file to train from the start, or put a copy of it back"
 
 
 def save_checkpoint(path: Path, state: Mapping[str, Any]) -> None:
@@ -107,7 +104,7 @@ def load_checkpoint(path: Path, device: str) -> dict[str, Any] | None:
     """
     if not path.exists():
         return None
-    with durable.opened_archive(path, "checkpoint", _REMEDY) as file, fitting(path):
+    with durable.opened_archive(path, "checkpoint", REMEDY) as file, parsing(f"the checkpoint {path}", REMEDY):
         state = torch.load(file, map_location=device, weights_only=True)
     form = state.get("format") if isinstance(state, dict) else None
     if form != CHECKPOINT_FORMAT:
@@ -116,18 +113,6 @@ def load_checkpoint(path: Path, device: str) -> dict[str, Any] | None:
             "continue it with the d2-4dgs that wrote it, or remove the file to train from the start"
         )
     return state
-
-
-@contextmanager
-def fitting(path: Path) -> Iterator[None]:
-    """Within it, a state that does not fit is one sentence."""
-    try:
-        yield
-    except D2Error:
-        raise
-    except MISFITS as error:
-        reason = f"{type(error).__name__}: {error}".splitlines()[0]
-        raise durable.Damaged(f"the checkpoint {path} is not one of this run ({reason}): {_REMEDY}") from None
 
 
 OnStep = Callable[[int, float], None]

@@ -195,15 +195,15 @@ def test_a_state_of_other_things() -> None:
     three, only_prune = {"streak": torch.zeros(3, dtype=torch.int64)}, replace(ALL_HOOKS, densify=None, depth_loss=None)
     for other, says in (
         ({}, "has no hooks, views, generator, idle, retired: give what d2.state_dict"),
-        (None, "has no hooks"),
+        (None, "cannot read the state of D2"),
         (hooks(config=only_prune).state_dict(), r"has \['densify', 'depth_loss', 'prune'\]"),
         (state | {"hooks": state["hooks"] | {"prune": three}}, r"streak of prune .* of 3 Gaussians"),
-        (state | {"hooks": {"densify": {}, "prune": None, "depth_loss": {}}}, "the state of D2 (does not fit|has)"),
+        (state | {"hooks": {"densify": {}, "prune": None, "depth_loss": {}}}, "cannot read the state of D2"),
         (state | {"inserted_at": torch.zeros(2, dtype=torch.int32)}, "inserted_at of d2 in the checkpoint"),
-        (state | {"views": 5}, "the state of D2 (does not fit|has)"),
-        (state | {"generator": torch.zeros(3)}, "the state of D2 (does not fit|has)"),
-        (state | {"idle": [1]}, "the state of D2 (does not fit|has)"),
-        (state | {"retired": "x"}, "the state of D2 (does not fit|has)"),
+        (state | {"views": 5}, "cannot read the state of D2"),
+        (state | {"generator": torch.zeros(3)}, "cannot read the state of D2"),
+        (state | {"idle": [1]}, "cannot read the state of D2"),
+        (state | {"retired": "x"}, "cannot read the state of D2"),
     ):
         refuses(says, d2.load_state_dict, other)
     d2.load_state_dict(state)
