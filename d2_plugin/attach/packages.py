@@ -23,7 +23,7 @@ import torch
 
 from d2_plugin.attach.session import Original, Recipe
 from d2_plugin.errors import D2Error
-from d2_plugin.reading import read_bytes, said
+from d2_plugin.reading import parsing, read_bytes, said
 
 log = logging.getLogger(__name__)
 
@@ -254,10 +254,8 @@ def _is_there(name: str) -> bool:
 def _imports(file: Path, conditional: bool) -> Iterator[tuple[str, int]]:
     """Names that a file imports when it is loaded, with lines; `from .a import b` gives .a.b, which is no package."""
     source = read_bytes(file, SCRIPT, MOST_SCRIPT).decode(errors="replace")
-    try:
+    with parsing(f"{file} as Python of this version", SCRIPT):
         tree = ast.parse(source)
-    except (SyntaxError, ValueError, RecursionError, MemoryError) as failure:
-        raise D2Error(f"{file} is no Python that this version reads ({said(failure)}): {SCRIPT}") from None
     for node in _at_once(tree, conditional):
         if isinstance(node, ast.Import):
             yield from ((alias.name, node.lineno) for alias in node.names)

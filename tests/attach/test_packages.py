@@ -145,4 +145,4 @@ def test_the_doctor_lists_what_a_trainer_lacks(script: Path, monkeypatch) -> Non
 def test_a_script_that_is_no_python_is_one_sentence(tmp_path: Path) -> None:
     path = tmp_path / "train.py"
     path.write_text("root:x:0:0:root:/root:/bin/bash")
-    refuses(r"train\.py is no Python that this version reads .* give the trainer's", needs, recipe("fudan"), path)
+    refuses(r"cannot read .*train\.py as Python of this version .* give the trainer's", needs, recipe("fudan"), path)

@@ -21,7 +21,7 @@ from d2_plugin.errors import D2Error, refuse_unknown
 from d2_plugin.extras import imported
 from d2_plugin.priors.monocular.align import KINDS
 from d2_plugin.priors.settings import Preprocessing
-from d2_plugin.reading import parsing, said
+from d2_plugin.reading import parsing
 from d2_plugin.recordings.images import opencv
 from d2_plugin.recordings.recording import MonoKind
 from d2_plugin.values import shown
@@ -241,7 +241,5 @@ def _session(path: Path, threads: int) -> Any:
     options.log_severity_level = 3
     available = onnxruntime.get_available_providers()
     providers = [name for name in ("CUDAExecutionProvider", "CPUExecutionProvider") if name in available]
-    try:
+    with parsing(f"{path} as an ONNX network", "give one that onnxruntime can run"):
         return onnxruntime.InferenceSession(str(path), options, providers=providers)
-    except Exception as error:  # onnxruntime's exceptions have no common base class
-        raise D2Error(f"{path} is not an ONNX network that onnxruntime can run: {said(error)}") from None

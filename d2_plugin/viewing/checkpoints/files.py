@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from d2_plugin.errors import D2Error
-from d2_plugin.reading import read_bytes, said
+from d2_plugin.reading import parsing, read_bytes
 from d2_plugin.values import checked_arguments
 
 MOST_PLY = 1 << 33
@@ -30,12 +30,9 @@ def read_tensors(path: Path) -> Any:
     scalar: Any = np.float32(0).__reduce__()[0]
     named = [(scalar, f"numpy.{core}.multiarray.scalar") for core in ("core", "_core")]
     allowed: list[Any] = [*named, np.dtype, np.dtypes.Float32DType, np.dtypes.Float64DType]
-    try:
-        with torch.serialization.safe_globals(allowed):
-            return torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:
-        said = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise D2Error(f"{path} cannot be read as a checkpoint of tensors ({said}): give the trainer's .pth") from None
+    safely = torch.serialization.safe_globals(allowed)
+    with parsing(f"{path} as a checkpoint of tensors", "give the trainer's .pth"), safely:
+        return torch.load(path, map_location="cpu", weights_only=True)
 
 
 def read_state(path: Path) -> dict[str, Tensor]:
@@ -81,7 +78,7 @@ def read_ply(path: Path) -> dict[str, Tensor]:
         D2Error: no such file, or one cut short.
     """
     data = read_bytes(path, "export it again", MOST_PLY)
-    try:
+    with parsing(f"{path} as a point cloud", "export it again"):
         head, end = data.split(b"end_header\n", 1)[0].decode("ascii").splitlines(), data.index(b"end_header\n") + 11
         if head[0] != "ply" or "format binary_little_endian 1.0" not in head:
             raise ValueError("expected a binary little-endian PLY")
@@ -90,8 +87,6 @@ def read_ply(path: Path) -> dict[str, Tensor]:
             raise ValueError(f"it says {count} vertices")
         fields = [line.split()[1:] for line in head if line.startswith("property") and " list " not in line]
         table = np.frombuffer(data, np.dtype([(name, KINDS[kind]) for kind, name in fields]), count, end)
-    except (ValueError, KeyError, IndexError, StopIteration, UnicodeDecodeError) as error:
-        raise D2Error(f"{path} is no readable point cloud ({said(error)}): export it again") from None
     return {name: torch.from_numpy(table[name].astype(np.float32)) for name in table.dtype.names or ()}
 
 

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from d2_plugin.errors import LONGEST_NAME, D2Error
-from d2_plugin.reading import field, parsing, read_bytes, read_text, said
+from d2_plugin.reading import field, parsing, read_bytes, read_text
 from d2_plugin.recordings.cameras.camera import LARGEST_NUMBER, CalibratedCamera, pinhole, rigid
 from d2_plugin.recordings.cameras.formats.document import CORRECT, Document, coefficients, has, numbers, object_of
 from d2_plugin.recordings.cameras.lens import Lens, checked_lens
@@ -217,15 +217,11 @@ def _file(folder: Path, part: str) -> Path:
 
 
 def _parse(path: Path, binary: Any, text: Any) -> Iterator[Any]:
-    try:
+    with parsing(f"{path} as a COLMAP model", "export the model again"):
         if path.suffix == ".bin":
             yield from binary(_Cursor(read_bytes(path, "export the model again")))
         else:
             yield from text(read_text(path, "export the model again").splitlines())
-    except D2Error:
-        raise
-    except (struct.error, ValueError, IndexError, OverflowError) as failure:
-        raise D2Error(f"{path} is damaged or no COLMAP model ({said(failure)}): export the model again") from None
 
 
 class _Cursor:
