@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
 from d2_plugin.errors import D2Error
-from d2_plugin.reading import MOST_TEXT, json_text, opened
+from d2_plugin.reading import MOST_TEXT, json_text, opened, parsing, read_bytes
 from d2_plugin.values import shown
 
 LEFTOVER = ".part"
@@ -189,21 +189,15 @@ def read_table(path: Path, kind: Kind) -> dict[str, Any]:
     """What `write_table` wrote, without version and checksum.
 
     Raises:
-        FileNotFoundError: no such file.
+        NoSuchFile: there is none.
         OtherFormat: another version wrote it.
-        Damaged: it cannot be read, is no table, or its content is not what was written.
+        Unreadable: it cannot be read, or is no table.
+        Damaged: its content is not what was written.
     """
-    try:
-        refuse_no_file(path)
-        if path.stat().st_size > MOST_TEXT:
-            raise ValueError(f"it has more than {MOST_TEXT} bytes")
-        table = json.loads(path.read_bytes())
+    with parsing(f"the {kind.name} {path}", kind.remedy):
+        table = json.loads(read_bytes(path, kind.remedy, MOST_TEXT))
         if not isinstance(table, dict):
             raise ValueError("it is no table")
-    except (FileNotFoundError, NotADirectoryError):
-        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path)) from None
-    except (OSError, ValueError, RecursionError) as error:
-        raise Damaged(f"the {kind.name} {path} is damaged ({error}): {kind.remedy}") from None
     if table.get("format") != kind.format:
         raise OtherFormat(
             f"the {kind.name} {path} has format {shown(table.get('format'))} but this version reads format "

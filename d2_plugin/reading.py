@@ -66,7 +66,7 @@ def opened(path: Path | str, remedy: str = RESTORE) -> Iterator[BinaryIO]:
         handle = os.open(path, os.O_RDONLY | _NO_WAITING)
     except D2Error:
         raise
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         raise NoSuchFile(f"cannot read {shown_path(path)} (there is no such file): {remedy}") from None
     except (OSError, ValueError) as failure:  # ValueError: a zero byte, or letters that no file name has
         raise Unreadable(f"cannot read {shown_path(path)} ({said(failure)}): {remedy}") from None
@@ -110,18 +110,12 @@ def parse_json(text: str, place: str, remedy: str = RESTORE) -> Any:
         Unreadable: no JSON; NaN, Infinity or a number beyond 1.8e308; a name twice in one object; too deep; letters
             that are half of a pair.
     """
-    try:
+    with parsing(f"{place} as JSON", remedy):
         content = json.loads(
             text, parse_constant=_no_constant, parse_float=_finite, parse_int=_whole, object_pairs_hook=_once
         )
         if "\\ud" in text.lower():  # half of a surrogate pair can be neither printed nor a file's name
             json.dumps(content, ensure_ascii=False).encode()
-    except RecursionError:
-        raise Unreadable(f"{place} is JSON nested too deeply: {remedy}") from None
-    except MemoryError:
-        raise Unreadable(f"{place} needs more memory than there is: {remedy}") from None
-    except ValueError as failure:
-        raise Unreadable(f"{place} is not JSON ({said(failure)}): {remedy}") from None
     return content
 
 
@@ -133,16 +127,10 @@ def read_toml(path: Path | str, remedy: str = RESTORE) -> dict[str, Any]:
 def parse_toml(text: str, place: str, remedy: str = RESTORE) -> dict[str, Any]:
     """The tables of a TOML text; `place` names the file in errors."""
     check_slow(text, place, remedy)
-    try:
+    with parsing(f"{place} as TOML", remedy):
         if any(part.count(".") > DEEPEST for part in re.split(r"[=,{\n]", text)):  # its time grows with the square
-            raise RecursionError
+            raise RecursionError("names are nested too deeply")
         return tomllib.loads(text)
-    except tomllib.TOMLDecodeError as failure:
-        raise Unreadable(f"{place} is not valid TOML ({said(failure)}): {remedy}") from None
-    except RecursionError:
-        raise Unreadable(f"{place} is TOML nested too deeply: {remedy}") from None
-    except (ValueError, OverflowError) as failure:  # digits without end, days that no calendar has
-        raise Unreadable(f"{place} has a value that TOML does not know ({said(failure)}): {remedy}") from None
 
 
 def check_slow(text: str, place: str, remedy: str) -> None:

@@ -265,7 +265,7 @@ def test_a_file_says_its_version_and_paths_are_its_folders(tmp_path: Path) -> No
     path.write_text(replace(ALL_HOOKS, prior="/somewhere").to_toml())
     assert D2Config.from_toml(path).prior == "/somewhere"
     path.write_text("[densify\n")
-    refuses("not valid TOML", D2Config.from_toml, path)
+    refuses("as TOML", D2Config.from_toml, path)
 
 
 def test_a_run_survives_its_file_and_names_another_version() -> None:

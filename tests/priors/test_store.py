@@ -124,7 +124,7 @@ def test_what_is_damaged_is_named_on_open(store: PriorStore, part: str, kept: in
     if kept is not None:
         path.write_bytes(whole[:kept])
     array = r"camera a, frame 0 is damaged .* run `d2 priors` again"
-    refuses(array if part == ".npy" else "00000.json is damaged", PriorStore.open, store.path)
+    refuses(array if part == ".npy" else "cannot read the record .*00000.json", PriorStore.open, store.path)
     if part == ".json":
         assert not store.is_current("a", 0, "k")
 

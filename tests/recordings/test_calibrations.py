@@ -139,7 +139,7 @@ NO_UNDISTORTION = "cam0 .* model {}, .*pinhole-equi or pinhole-radtan"
     ("write", "message"),
     [
         (file_with("cam.pickle", b"\x80\x04\x95."), "is a pickle, which can run any program .* convert it to TOML"),
-        (file_with("notes.txt", b"four cameras"), "txt, which looks like no XML, JSON or YAML, is not valid TOML"),
+        (file_with("notes.txt", b"four cameras"), "txt, which looks like no XML, JSON or YAML, as TOML"),
         (file_with("a.json", b'{"frames": 3}'), "no calibration that can be read: expected one of folder, caliscope"),
         (lambda path: path / "b.json", "no such calibration"),
         (file_with("a.yaml", b"a: &a [1]\ncam0: *a\n"), "has YAML aliases"),

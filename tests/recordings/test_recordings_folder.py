@@ -139,7 +139,7 @@ def test_images_of_two_sizes_are_refused_when_read(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"fx": float("nan")}, "cameras.json is not JSON .*NaN, which is not finite"),
+        ({"fx": float("nan")}, "cameras.json as JSON .*NaN, which is not finite"),
         ({"fy": -3.0}, "focal lengths"),
         ({"R": [[1, 0, 0], [0, 1, 0], [0, 0, -1]]}, r"camera train0 .* an R that is no rotation \(orthonormal rows"),
         ({"R": [[1.01, 0, 0], [0, 1.01, 0], [0, 0, 1.01]]}, "no rotation"),
@@ -162,4 +162,4 @@ def test_broken_descriptions_are_refused(folder: Path) -> None:
     path.write_text(path.read_text().replace('"cx"', '"x"', 1))
     refused(folder, "camera train0 .* has no cx")
     path.write_text("{")
-    refused(folder, re.escape(str(path)) + " is not JSON")
+    refused(folder, re.escape(str(path)) + " as JSON")
