@@ -12,10 +12,10 @@ from dataclasses import asdict, dataclass, make_dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Optional, cast
 
-from d2_plugin.errors import D2Error, unknown_name
+from d2_plugin.errors import unknown_name
 from d2_plugin.hooks import HOOKS, DensifyConfig, DepthLossConfig, MotionConfig, ParallaxConfig, PruneConfig
 from d2_plugin.hooks.prior import Belief
-from d2_plugin.reading import NoSuchFile, read_toml
+from d2_plugin.reading import read_toml
 from d2_plugin.settings import FORMAT, NONE, AtLeastOne, Count, Range, Seed, Settings, of_this_format
 from d2_plugin.values import checked_arguments
 
@@ -98,10 +98,7 @@ class D2Config(_HookTables):
         `iterations` is the length of the run where the file does not say one; `pace` as in `from_dict`.
         """
         path = Path(path)
-        try:
-            table = read_toml(path, "correct the configuration")
-        except NoSuchFile:
-            raise D2Error(f"no configuration at {path}: write one, or pass the settings as a dict") from None
+        table = read_toml(path, "correct the configuration, or pass the settings as a dict")
         length = {} if iterations is None else {"iterations": iterations}
         config = cls.from_dict(length | of_this_format(table, str(path)), pace=pace)
         below = {name: str(path.parent / value) for name in ("prior", "exported") if (value := getattr(config, name))}

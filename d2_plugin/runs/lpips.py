@@ -44,12 +44,10 @@ class Lpips:
         with torch.device("meta"):  # no random initial weights, which would advance the global random state
             self.layers = _alexnet() if net == "alex" else _vgg16()
         trained, weights, prefix = _load(features), _load(linear), "features."
-        try:
+        with parsing(f"{features} and {linear} as LPIPS {net}", "check the files"):
             convolutions = {k[len(prefix) :]: v for k, v in trained.items() if k.startswith(prefix)}
             self.layers.load_state_dict(convolutions, assign=True)
             self.weights = [weights[f"lin{i}.model.1.weight"].flatten() for i in range(len(_TAPS[net]))]
-        except (RuntimeError, KeyError) as failure:
-            raise D2Error(f"{features} and {linear} do not fit LPIPS {net} ({failure}): check the files") from None
         self.layers.eval().requires_grad_(False)
 
     @property

@@ -13,7 +13,7 @@ from d2_plugin.config import D2Config, for_iterations
 from d2_plugin.errors import D2Error, refuse_unknown, unknown_name
 from d2_plugin.hooks import HOOKS
 from d2_plugin.priors.settings import PriorSettings
-from d2_plugin.reading import said, shown_path
+from d2_plugin.reading import parsing, shown_path
 from d2_plugin.settings import (
     FORMAT,
     Count,
@@ -127,10 +127,8 @@ def check(settings: RunSettings) -> RunSettings:
 def _absolute(path: str, name: str) -> str:
     if not path:
         raise D2Error(f"{name} is no text at all, expected a path: name it, or a dot for the current folder")
-    try:
+    with parsing(f"{name} {shown_path(path)[:200]}", "correct it"):  # a zero byte, a name too long, links in a circle
         return str(Path(path).resolve())
-    except (OSError, ValueError, RuntimeError) as failure:  # a zero byte, a name too long, links in a circle
-        raise D2Error(f"{name} is {shown_path(path)[:200]}, which is no path ({said(failure)}): correct it") from None
 
 
 def _check_overrides(settings: RunSettings) -> None:

@@ -126,7 +126,9 @@ class TestPlaces:
         plan = ["plan", str(small), "--train-cameras", "cam00", "--config"]
         assert "is a pipe, expected a file" in refused(*plan, str(tmp_path / "pipe.toml"))
         assert "is a folder, expected a file" in refused(*plan, str(tmp_path))
-        assert "no configuration at" in refused(*plan, str(tmp_path / "none.toml"))
+        assert "(there is no such file): correct the configuration, or leave out --config" in refused(
+            *plan, str(tmp_path / "none.toml")
+        )
 
     @pytest.mark.parametrize("output", ["file", "file/below", "x" * 300, "a/" + "y" * 5000])
     def test_an_output_that_cannot_be(self, small: Path, tmp_path: Path, refused: Refused, output: str) -> None:

@@ -209,7 +209,7 @@ def test_without_weights_it_is_not_available_and_says_so_once(tmp_path: Path, ca
 def test_files_that_are_no_weights_are_refused(tmp_path: Path) -> None:
     write_weights(tmp_path)
     torch.save({"lin0.model.1.weight": torch.rand(1, 64, 1, 1)}, tmp_path / "alex.pth")
-    refuses("do not fit LPIPS alex", find_lpips, "alex", tmp_path)
+    refuses("as LPIPS alex .*: check the files", find_lpips, "alex", tmp_path)
     (tmp_path / "alex.pth").write_bytes(b"nothing")
     refuses(r"cannot read LPIPS weights .*alex\.pth", find_lpips, "alex", tmp_path)
     refuses("unknown LPIPS network 'squeeze'", find_lpips, "squeeze", tmp_path)

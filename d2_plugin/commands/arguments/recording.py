@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any, get_args
 from d2_plugin.commands.arguments.form import Form, Given, Group
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.progress import show
-from d2_plugin.reading import NoSuchFile, shown_path
 from d2_plugin.reading import read_toml as tables_of_toml
 from d2_plugin.settings import Settings, declared
 
@@ -135,12 +134,7 @@ def hook_names(text: str) -> tuple[str, ...]:
 
 def read_toml(path: Path | None) -> dict[str, Any]:
     """The tables of a --config file; none where there is no file."""
-    if path is None:
-        return {}
-    try:
-        return tables_of_toml(path, "correct the configuration")
-    except NoSuchFile:
-        raise D2Error(f"no configuration at {shown_path(path)}: write one, or leave out --config") from None
+    return {} if path is None else tables_of_toml(path, "correct the configuration, or leave out --config")
 
 
 def show_notes(notes: Sequence[str]) -> None:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from d2_plugin.errors import D2Error
-from d2_plugin.reading import parsing, read_bytes
+from d2_plugin.reading import parsing, read_bytes, read_text
 from d2_plugin.values import checked_arguments
 
 MOST_PLY = 1 << 33
@@ -53,16 +53,12 @@ def read_options(path: Path) -> dict[str, Any]:
     Raises:
         D2Error: no such file, or another text.
     """
-    if not path.is_file():
-        raise D2Error(f"{path} is not there: it says how the trainer was set, copy it along with the point cloud")
-    try:
-        call = ast.parse(path.read_text(encoding="utf-8").strip(), mode="eval").body
-    except (SyntaxError, ValueError):
-        call = None
-    if not isinstance(call, ast.Call):
-        raise D2Error(f"{path} is no list of options: expected Namespace(name=value, ...), as the trainer writes it")
+    text = read_text(path, "copy it along with the point cloud, it says how the trainer was set")
+    with parsing(f"{path} as a list of options", "expected Namespace(name=value, ...), as the trainer writes it"):
+        call: Any = ast.parse(text.strip(), mode="eval").body
+        keywords = call.keywords
     found = {}
-    for keyword in call.keywords:
+    for keyword in keywords:
         try:
             found[str(keyword.arg)] = ast.literal_eval(keyword.value)
         except ValueError:  # an object: nothing that is asked for

@@ -12,7 +12,7 @@ import numpy as np
 
 from d2_plugin.errors import D2Error
 from d2_plugin.extras import imported
-from d2_plugin.reading import DEEPEST, check_slow, field, parse_json, parse_toml, parsing, read_bytes, read_text, said
+from d2_plugin.reading import DEEPEST, check_slow, field, parse_json, parse_toml, parsing, read_bytes, read_text
 from d2_plugin.recordings.cameras.camera import LARGEST_NUMBER
 from d2_plugin.values import Range, shown
 
@@ -112,10 +112,8 @@ def object_of(entry: Any, what: str) -> Table:
 def numbers(table: Table, key: str, shape: tuple[int, ...], place: str, remedy: str = CORRECT) -> np.ndarray:
     """The array under `key`, float64 [*shape], nested in lists or not; -1 in `shape` stands for any length."""
     value = field(table, key, list, place, remedy)
-    try:
+    with parsing(f"{key} of {place}, {shown(value)},", remedy):
         array = np.array(value, np.float64)
-    except (TypeError, ValueError, OverflowError) as failure:
-        raise D2Error(f"{key} of {place} is {shown(value)}, which cannot be understood ({said(failure)})") from None
     if -1 not in shape and array.size != np.prod(shape):
         raise D2Error(
             f"{key} of {place} cannot be understood: it is {shown(value)}, expected "
