@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import logging
-import operator
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 import torch.nn.functional as F
@@ -14,7 +13,7 @@ from torch import Tensor
 
 from d2_plugin.errors import D2Error
 from d2_plugin.protocol import Backbone, DepthPrior, Label, Splats, View, call_optional
-from d2_plugin.values import fitting, shown
+from d2_plugin.values import Range, fitting, shown
 
 _log = logging.getLogger(__name__)
 
@@ -229,12 +228,7 @@ def check_surroundings() -> None:
 
 def check_step(step: object) -> None:
     """Refuse what is no number of an optimizer step."""
-    try:
-        fits = not isinstance(step, bool) and operator.index(step) >= 0  # type: ignore[arg-type]
-    except TypeError:
-        fits = False
-    if not fits:
-        raise D2Error(f"d2 got {shown(step)} as the step: give the number of the optimizer's step, 0 or more")
+    fitting(Annotated[int, Range(0)], step, "the number of the optimizer's step, which d2.loss and d2.step take,")
 
 
 def check_state(state: Mapping[str, Any], hooks: Mapping[str, Any], count: int) -> None:

@@ -213,7 +213,7 @@ def test_a_state_of_other_things() -> None:
 def test_what_is_no_step(step: Any) -> None:
     d2 = hooks()
     for call in (lambda: d2.step(step), lambda: d2.loss(step, VIEWS[:1])):
-        refuses("as the step: give the number of the optimizer's step", call)
+        refuses("the number of the optimizer's step, which d2.loss and d2.step take, must be", call)
 
 
 def in_float64(splats: Splats) -> Splats:
