@@ -14,11 +14,11 @@ import itertools
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import ClassVar
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 
-from d2_plugin.errors import D2Error, unknown_name
+from d2_plugin.errors import D2Error
 from d2_plugin.priors.colmap.workspace import WorkspaceDepth
 from d2_plugin.priors.frame import Frame, digest
 from d2_plugin.priors.geometric_source import GeometricSource
@@ -27,17 +27,15 @@ from d2_plugin.priors.stereo.depth_range import DepthBounds
 from d2_plugin.priors.stereo.filtering.filter import GeometricDepth, filter_depths, remove_speckles
 from d2_plugin.priors.stereo.geometric_depth import gray
 from d2_plugin.priors.stereo.settings import StereoSettings
-from d2_plugin.reading import read_json
+from d2_plugin.reading import field, read_json
 from d2_plugin.recordings.files import files_by_camera
 from d2_plugin.recordings.recording import Camera, Recording
-from d2_plugin.values import shown
+from d2_plugin.values import Range, shown
 
 UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 """Metres per unit."""
 
-ALONG = ("z", "ray")
-"""What a sensor's numbers are measured along: planar depth, or the distance from the camera's centre."""
-SCALES = (1e-9, 1e9)
+Scale = Annotated[float, Range(1e-9, 1e9)]
 """World units per stored number that depth.json may say."""
 
 NEIGHBOURS = 2
@@ -198,13 +196,9 @@ def _meaning(path: Path) -> tuple[float, bool]:
     table = read_json(path, "write either scale (world units per stored number) or unit into it")
     if ("unit" in table) == ("scale" in table):
         raise D2Error(f"{path} must have either scale (world units per stored number) or unit, got {shown(table)}")
-    along, unit, scale = table.get("along", ALONG[0]), table.get("unit"), table.get("scale")
-    if along not in ALONG:
-        raise unknown_name(f"along in {path}", str(along)[:40], ALONG)
+    along = field(table, "along", Literal["z", "ray"], str(path), "correct it", default="z")
     if "unit" in table:
-        if not isinstance(unit, str) or unit not in UNITS:
-            raise unknown_name(f"unit in {path}", str(unit)[:40], UNITS)
-        scale = UNITS[unit]
-    elif isinstance(scale, bool) or not isinstance(scale, int | float) or not SCALES[0] <= scale <= SCALES[1]:
-        raise D2Error(f"{path} says scale {shown(scale)}, expected world units per stored number above 0: correct it")
-    return float(scale), along == "ray"
+        scale = UNITS[field(table, "unit", Literal["m", "cm", "mm"], str(path), "correct it")]
+    else:
+        scale = field(table, "scale", Scale, str(path), "correct it")
+    return scale, along == "ray"

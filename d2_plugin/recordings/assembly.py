@@ -11,19 +11,17 @@ import logging
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import cast, get_args
 
 import numpy as np
 
 from d2_plugin.arrays import read_array
 from d2_plugin.errors import D2Error
-from d2_plugin.reading import read_json
+from d2_plugin.reading import field, read_json
 from d2_plugin.recordings.cameras.camera import CalibratedCamera
 from d2_plugin.recordings.cameras.undistort import UndistortedSource, refuse_black
 from d2_plugin.recordings.files import FrameFiles, files_by_camera
 from d2_plugin.recordings.images import MASK_FOLDERS, VALID_FOLDER, read_image, read_mask
 from d2_plugin.recordings.recording import MonoKind, Recording, Source
-from d2_plugin.values import shown
 
 log = logging.getLogger(__name__)
 
@@ -133,13 +131,8 @@ def _masks(path: Path, names: Iterable[str]) -> tuple[dict[str, FrameFiles], tup
 def _mono_description(path: Path) -> tuple[MonoKind, bool]:
     declared = path / "mono" / "mono.json"
     content = read_json(declared, CORRECT) if declared.exists() else {}
-    kind, emulated = content.get("kind", "relative"), content.get("emulated", False)
-    if not isinstance(kind, str) or kind not in get_args(MonoKind) or not isinstance(emulated, bool):
-        raise D2Error(
-            f"{declared} says kind {shown(kind)} and emulated {shown(emulated)}: "
-            "expected 'relative' or 'metric', and true or false"
-        )
-    return cast(MonoKind, kind), emulated
+    kind: MonoKind = field(content, "kind", MonoKind, str(declared), CORRECT, default="relative")
+    return kind, field(content, "emulated", bool, str(declared), CORRECT, default=False)
 
 
 def _map(path: Path, key: str | None) -> np.ndarray:

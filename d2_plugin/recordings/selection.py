@@ -11,7 +11,8 @@ import numpy as np
 from d2_plugin.errors import D2Error, refuse_unknown
 from d2_plugin.recordings.images import shrink_depth, shrink_image, shrink_mask
 from d2_plugin.recordings.recording import Camera, Recording, Source
-from d2_plugin.values import checked_arguments
+from d2_plugin.settings import Downscale
+from d2_plugin.values import checked_arguments, fitting
 
 T = TypeVar("T")
 
@@ -50,8 +51,7 @@ def downscale(recording: Recording, factor: int) -> Recording:
     Rows and columns that fill no block are cut off at the bottom and on the right, so K / factor is exact with pixel
     centres at i + 0.5. Monocular maps keep the size they are stored in.
     """
-    if isinstance(factor, bool) or not isinstance(factor, (int, np.integer)) or factor < 1:
-        raise D2Error(f"downscale {factor!r} is no whole number of at least 1: give 1, 2, 4 or the like")
+    factor = fitting(Downscale, factor, "downscale")
     if factor == 1:
         return recording
     cameras = {name: _smaller_camera(camera, factor) for name, camera in recording.cameras.items()}

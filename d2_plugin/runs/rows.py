@@ -143,11 +143,9 @@ def read_rows(paths: Sequence[Path]) -> list[Row]:
 
 def _checked(line: str, where: str) -> Row:
     row = parse_json(line, where, "restore the file, or remove that line")
-    missing = [name for name in FORM if not isinstance(row, dict) or name not in row]
-    if missing:
-        raise D2Error(f"{where} has no {', '.join(missing)}: measure it again, its form is not that of this version")
     for name, kind in FORM.items():
-        field(row, name, kind, where, "measure it again, its form is not that of this version")
+        known = row if isinstance(row, dict) else {}
+        field(known, name, kind, where, "measure it again, its form is not that of this version")
     return row
 
 

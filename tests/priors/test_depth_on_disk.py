@@ -119,10 +119,10 @@ def test_sensor_depth_comes_at_the_size_of_the_images_and_empty_where_it_is_none
     ("description", "message"),
     [
         ({"unit": "m", "scale": 1}, "either scale .* or unit"),
-        ({"unit": "feet"}, "unknown unit in .*depth.json 'feet'"),
-        ({"scale": -1}, "scale -1, expected"),
-        ({"scale": 1, "along": "rays"}, "unknown along in .*depth.json 'rays'.*ray"),
-        ({"scale": "1"}, "scale '1', expected"),
+        ({"unit": "feet"}, "unknown unit of .*depth.json 'feet'"),
+        ({"scale": -1}, "scale of .*depth.json must be above 0, got -1"),
+        ({"scale": 1, "along": "rays"}, "unknown along of .*depth.json 'rays'.*ray"),
+        ({"scale": "1"}, "scale of .*depth.json must be a number, got '1'"),
         ([], "either scale .* or unit"),
     ],
 )

@@ -69,7 +69,7 @@ def test_maps_are_declared_in_mono_json_and_optional(folder: Path) -> None:
     assert recording.mono_kind == "metric"
     assert not recording.mono_emulated
     (folder / "mono" / "mono.json").write_text('{"kind": "disparity"}')
-    refused(folder, r"mono\.json says kind 'disparity'.*expected 'relative' or 'metric'")
+    refused(folder, r"unknown kind of .*mono\.json 'disparity': have metric, relative")
     shutil.rmtree(folder / "depth")
     shutil.rmtree(folder / "mono")
     recording = open_recording(folder)

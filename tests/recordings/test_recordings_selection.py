@@ -103,7 +103,7 @@ def test_a_downscaled_recording_projects_points_to_the_same_place() -> None:
     assert small.mono("train0", 0).shape == (38, 50)
     np.testing.assert_array_equal(small.image("train0", 0), shrink_image(recording.image("train0", 0), 4))
     assert downscale(recording, 1) is recording
-    refuses("no whole number of at least 1", downscale, recording, 0)
+    refuses("downscale must be at least 1", downscale, recording, 0)
 
 
 def test_selections_are_checked() -> None:

@@ -122,7 +122,7 @@ def test_files_that_cannot_be_are_refused(tmp_path: Path) -> None:
     write(tmp_path, [])
     refused(tmp_path, "that lists images")
     (tmp_path / "transforms.json").write_text('{"camera_angle_x": 1}')
-    refused(tmp_path, "has no list 'frames'")
+    refused(tmp_path, "has no frames: write one entry per image")
     refused(write(tmp_path, [entry("a_0", time=None)]), "time of an image in .* must be a number, got None")
     refused(write(tmp_path, [entry("a_0", transform_matrix=[[1, 0], [0, 1]])]), "cannot be understood")
     refused(write(tmp_path, [entry("a_0", time=0.0), entry("a_1")]), "some images .* have a time")

@@ -172,7 +172,11 @@ def test_rows_are_appended_and_read_back_with_what_is_not_a_number_as_null(tmp_p
 
 @pytest.mark.parametrize(
     ("line", "message"),
-    [("{", "line 2 as JSON"), ('{"kind": "raster"}', "line 2 has no case, method"), ("[]", "line 2 has no kind")],
+    [
+        ("{", "line 2 as JSON"),
+        ('{"kind": "raster"}', "line 2 has no case"),
+        ("[]", "line 2 has no kind"),
+    ],
 )
 def test_a_line_that_is_no_row_is_named(tmp_path: Path, line: str, message: str) -> None:
     path = tmp_path / "runs.jsonl"

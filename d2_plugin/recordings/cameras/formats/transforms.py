@@ -39,9 +39,7 @@ class ListedImage(NamedTuple):
 
 def listed_images(content: Table, where: str) -> list[ListedImage]:
     """All images that a transforms.json lists."""
-    frames = content.get("frames")
-    if not isinstance(frames, list):
-        raise D2Error(f"{where} has no list 'frames': write one entry per image")
+    frames = field(content, "frames", list, where, "write one entry per image")
     common = {key: value for key, value in content.items() if key != "frames"}
     return [_listed(frame, common, f"an image in {where}") for frame in frames]
 
