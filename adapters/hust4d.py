@@ -17,7 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from d2_plugin.errors import D2Error
+from d2_plugin.errors import refuse_unknown
 from d2_plugin.gaussians.rotation4d import unit_quaternions
 from d2_plugin.protocol import Points, Splats, View
 
@@ -65,8 +65,7 @@ class Hust4DAdapter(InriaAdapter):
 
     def enter_stage(self, stage: str) -> None:
         """From now on the model is drawn as in this stage."""
-        if stage not in STAGES:
-            raise D2Error(f"stage must be one of {', '.join(STAGES)}, got '{stage}': pass scene_reconstruction's own")
+        refuse_unknown("stage of scene_reconstruction", [stage], STAGES)
         self.stage = stage
 
     def active(self, step: int) -> bool:

@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass, make_dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Optional, cast
 
-from d2_plugin.errors import unknown_name
+from d2_plugin.errors import refuse_unknown, unknown_name
 from d2_plugin.hooks import HOOKS, DensifyConfig, DepthLossConfig, MotionConfig, ParallaxConfig, PruneConfig
 from d2_plugin.hooks.prior import Belief
 from d2_plugin.reading import read_toml
@@ -127,11 +127,9 @@ def for_iterations(hooks: Iterable[str], iterations: int, **settings: Any) -> D2
 
     The schedule of a hook is that of its settings, see `HookConfig.for_iterations`.
     """
-    chosen: dict[str, Any] = {}
-    for name in hooks:
-        if name not in HOOKS:
-            raise unknown_name("hook", name, ["prior", *HOOKS])
-        chosen[name] = HOOKS[name].config.for_iterations(iterations)
+    names = list(hooks)
+    refuse_unknown("hook", names, HOOKS)
+    chosen: dict[str, Any] = {name: HOOKS[name].config.for_iterations(iterations) for name in names}
     return D2Config(**chosen, **settings)
 
 

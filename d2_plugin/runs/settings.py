@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 
 from d2_plugin import registry
 from d2_plugin.config import D2Config, for_iterations
-from d2_plugin.errors import D2Error, refuse_unknown, unknown_name
+from d2_plugin.errors import D2Error, refuse_unknown
 from d2_plugin.hooks import HOOKS
 from d2_plugin.priors.settings import PriorSettings
 from d2_plugin.reading import parsing, shown_path
@@ -111,9 +111,7 @@ def check(settings: RunSettings) -> RunSettings:
 
     if not settings.train_cameras:
         raise D2Error("no training camera: name at least one with --train-cameras")
-    for name in settings.hooks:
-        if name not in HOOK_NAMES:
-            raise unknown_name("hook", name, [*HOOK_NAMES, "all", "none"])
+    refuse_unknown("hook", settings.hooks, HOOK_NAMES)
     if settings.mono_onnx and settings.mono_kind is None:
         raise D2Error("--mono-onnx needs --mono-kind relative (inverse depth) or metric (depth): the file names none")
     if settings.device == "cuda" and not torch.cuda.is_available():

@@ -210,7 +210,7 @@ class TestDeformations:
         assert d2.step(10).inserted == 0
         eager = D2Hooks(HOOKS, Hust4DAdapter(model, scene, "coarse", active_stages=("coarse", "fine")), TinyStore())
         assert isinstance(eager.loss(10, scene.cameras[:2]), Tensor)
-        refuses("stage must be one of coarse, fine, got 'medium'", Hust4DAdapter, model, scene, "medium")
+        refuses("stage of scene_reconstruction 'medium': have coarse, fine", Hust4DAdapter, model, scene, "medium")
 
 
 def test_another_codebase_than_the_adapters_is_refused() -> None:

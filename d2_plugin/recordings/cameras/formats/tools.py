@@ -11,7 +11,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from d2_plugin.errors import D2Error
+from d2_plugin.errors import D2Error, refuse_unknown
 from d2_plugin.reading import field
 from d2_plugin.recordings.cameras.camera import OPENCV_CENTRE, CalibratedCamera, pinhole, rigid
 from d2_plugin.recordings.cameras.formats.document import (
@@ -171,8 +171,7 @@ def _multical_camera(name: str, entry: Any, poses: Table, document: str) -> Cali
     place = f"camera {name} in {document}"
     table = object_of(entry, place)
     model = field(table, "model", str, place, CORRECT, default="standard")
-    if model not in MULTICAL_MODELS:
-        raise D2Error(f"{place} has the model {model}, expected one of {', '.join(MULTICAL_MODELS)}: {CORRECT}")
+    refuse_unknown(f"model of {place}", [model], MULTICAL_MODELS)
     keys = [key for key in poses if key == name or key.startswith(f"{name}_to_")]
     if len(keys) != 1 or not isinstance(poses[keys[0]], dict):
         raise D2Error(f"{place} has {len(keys)} poses in camera_poses, expected one: calibrate it again or remove it")
