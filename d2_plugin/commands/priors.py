@@ -99,6 +99,9 @@ def cluster_of(options: PriorOptions) -> dict[str, Any] | None:
         return None
     if options.shard is not None:
         raise D2Error("--shard builds one part on this machine: leave it out with --workers or --scheduler")
-    if options.scheduler is not None:
+    if options.scheduler is None:
+        return {"workers": options.workers}
+    from d2_plugin.priors.dask_build import cluster_client  # needs an extra
+
+    with cluster_client(options.scheduler, 0):  # or say at once that nobody answers
         return {"scheduler": options.scheduler}
-    return {"workers": options.workers}

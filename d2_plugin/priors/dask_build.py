@@ -102,8 +102,9 @@ def cluster_client(scheduler: str | None, workers: int, purpose: str = "building
     distributed = imported("distributed", "dask.distributed", "cluster", purpose)
     if scheduler is not None:
         try:
+            distributed.comm.get_address_host_port(scheduler)  # a client without an address ends its process slowly
             client = distributed.Client(scheduler, timeout="10s", set_as_default=False)
-        except (OSError, TimeoutError, ValueError) as error:
+        except (OSError, TypeError, ValueError) as error:
             raise D2Error(
                 f"no dask scheduler answers at {scheduler} ({error}): start one with `dask scheduler`, or leave the "
                 "address out for workers on this machine"

@@ -4,6 +4,7 @@ import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -112,6 +113,17 @@ def test_a_hook_that_changes_nothing_retires_and_the_scores_say_so(recording, fi
 def test_a_part_that_cannot_be_built_is_refused(recording: Path, tmp_path, refused, shard: str, says: str) -> None:
     build = ["priors", recording, "--train-cameras", CAMERAS, "--output", tmp_path / "priors", "--shard"]
     assert says in refused(*build, *shard.split())
+
+
+@pytest.mark.parametrize("command", [("priors", "nowhere", "--train-cameras", "a"), ("bench", "training", "nowhere@a")])
+@pytest.mark.parametrize(("at", "why"), [("there", "missing port"), ("tcp://127.0.0.1:1", "Timed out")])
+def test_a_cluster_that_is_not_there_is_refused_before_anything_is_read(refused, monkeypatch, command, at, why) -> None:
+    distributed = pytest.importorskip("distributed", reason="dask.distributed is in the `cluster` extra")
+    connect = Mock(side_effect=lambda at, **more: client(at, **(more | {"timeout": "0.2s"})))
+    client, _ = distributed.Client, monkeypatch.setattr(distributed, "Client", connect)
+    said = refused(*command, "--scheduler", at, "--output", "here")
+    assert f"no dask scheduler answers at {at} ({why}" in said
+    assert connect.called == (why == "Timed out"), "a client without an address waits 20 s when it is forgotten"
 
 
 def test_compare_tabulates_what_was_measured_and_keeps_runs_of_one_name_apart(finished, tmp_path, answered) -> None:

@@ -101,16 +101,16 @@ def run(
     known = read_rows([path]) if path.is_file() else []
     chosen = rows_named(settings.methods, presets, tables)
     command = command_line(name, settings)
-    lines = [line for text in settings.recordings for line in _lines(settings, text, chosen, known, command)]
-    with progress_bar(name, len(lines) * len(settings.seeds) * len(_targets(settings))) as bar:
-        done: list[Row] = []
+    with workers(settings.jobs, settings.scheduler) as submit:  # or say that nobody answers, before priors are made
+        lines = [line for text in settings.recordings for line in _lines(settings, text, chosen, known, command)]
+        with progress_bar(name, len(lines) * len(settings.seeds) * len(_targets(settings))) as bar:
+            done: list[Row] = []
 
-        def write(row: Row) -> None:
-            append_rows(path, [{**row, **(about or {})}])
-            done.extend([row] if row["target"] != TRY else [])  # a run that finds a length is beside the count
-            bar.update(len(done), f"{row['case']}: {row['method']}, {row['setting']}")
+            def write(row: Row) -> None:
+                append_rows(path, [{**row, **(about or {})}])
+                done.extend([row] if row["target"] != TRY else [])  # a run that finds a length is beside the count
+                bar.update(len(done), f"{row['case']}: {row['method']}, {row['setting']}")
 
-        with workers(settings.jobs, settings.scheduler) as submit:
             follow(lines, submit, write)
     return f"rows are in {path}; `d2 report {path}` draws them"
 
