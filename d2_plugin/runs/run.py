@@ -97,11 +97,12 @@ class Run:
         Raises:
             D2Error: no view has a usable prior, and the settings do not allow that.
         """
-        with self._writing(), self._timed("priors"):
+        with self._writing(), self._timed("priors") as keep:
             points = self._points()
+            keep()
             if self.uses_prior:
                 between = "motion" in hooks_in_use(self.settings)
-                summary = build_priors_for(self.scene, points.positions, self._store, between=between)
+                summary = build_priors_for(self.scene, points.positions, self._store, between=between, on_view=keep)
                 if on_prior is not None:
                     on_prior(summary)
                 refuse_unusable(summary, self.settings.accept_empty_prior)
@@ -253,17 +254,24 @@ class Run:
                 self._writes = False
 
     @contextmanager
-    def _timed(self, name: str) -> Iterator[None]:
-        start, cpu = time.monotonic(), time.process_time()
-        try:
-            yield
-        finally:
-            self.seconds[name] += time.monotonic() - start
-            self.cpu_seconds[name] += time.process_time() - cpu
+    def _timed(self, name: str) -> Iterator[Callable[[], None]]:
+        """Count the time of the block; what it gives counts and keeps what went by so far."""
+        last = time.monotonic(), time.process_time()
+
+        def keep() -> None:
+            nonlocal last
+            before, last = last, (time.monotonic(), time.process_time())
+            self.seconds[name] += last[0] - before[0]
+            self.cpu_seconds[name] += last[1] - before[1]
             if self._checkpoint.exists():  # which says it from now on
                 self._spent.unlink(missing_ok=True)
             else:  # until then a run that is cut off would forget it
                 write_table(self._spent, {"seconds": [self.seconds["priors"], self.cpu_seconds["priors"]]}, COST)
+
+        try:
+            yield keep
+        finally:
+            keep()
 
 
 def _about(run: Run, trainer: Any) -> dict[str, Any]:

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 from d2_plugin.durable import Kind, make_folder, read_table, write_table
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.frame import view_digest
-from d2_plugin.priors.summary import PriorSummary
 from d2_plugin.recordings import open_recording
 from d2_plugin.runs.prior.build import build_priors_for
 from d2_plugin.runs.prior.trials import can_decide, tried
@@ -44,8 +43,8 @@ class Shared:
 
     @property
     def seconds(self) -> float | None:
-        """CPU seconds that points and prior took, wall seconds where a cluster built the prior; None where a build was
-        cut off, since its parts were not timed together."""
+        """CPU seconds that points and prior took, wall seconds where a cluster built the prior; None where something
+        was there that nobody timed."""
         records = [record for made in (self.points, self.priors) if (record := _record(made)).is_file()]
         parts = [read_table(record, COST)["seconds"] for record in records]
         return None if len(parts) < 2 or None in parts else sum(parts)
@@ -59,9 +58,11 @@ def share_points(settings: RunSettings, folder: Path) -> Path:
     camera = settings.train_cameras[0]
     seen = open_recording(settings.recording, cameras=[camera], frames=settings.frames, downscale=settings.downscale)
     of["recording"] = view_digest(seen, camera, seen.frames[-1])
-    if not _record(points).is_file():
+    if not _finished(points):
         scene = Scene.open(check(settings))
-        _timed(points, lambda: triangulated_points(scene.recording, scene.train_cameras).save(points), of=of)
+        with _timed(points, of=of) as keep:
+            triangulated_points(scene.recording, scene.train_cameras).save(points)
+            keep()
     elif other := [name for name, kept in read_table(_record(points), COST).get("of", of).items() if kept != of[name]]:
         raise D2Error(f"{folder} holds points and priors of another {', '.join(other)}: give another --output")
     return points
@@ -76,16 +77,13 @@ def share(settings: RunSettings, folder: Path, cluster: Mapping[str, Any] | None
     """
     shared = Shared(folder, prior_settings(settings).variant)
     points = share_points(settings, folder)
-    if not _record(shared.priors).is_file():
+    if not _finished(shared.priors):
         scene, known = Scene.open(check(replace(settings, hooks=HOOK_NAMES))), TimedPoints.load(points)
         clock = time.process_time if cluster is None else time.monotonic
-        build = partial(build_priors_for, scene, known.positions, shared.priors, cluster=cluster)
-
-        def try_out(summary: PriorSummary) -> None:
+        with _timed(shared.priors, clock) as keep:
+            summary = build_priors_for(scene, known.positions, shared.priors, cluster=cluster, on_view=keep)
             if summary.usable and can_decide(settings, scene):
                 tried(settings, scene, known, shared.priors)  # counted with the runs that use it
-
-        _timed(shared.priors, build, clock, try_out)
     return shared
 
 
@@ -93,17 +91,22 @@ def _record(made: Path) -> Path:
     return Path(f"{made}.seconds.json")
 
 
-def _timed(
-    made: Path,
-    make: Callable[[], Any],
-    clock: Callable[[], float] = time.process_time,
-    then: Callable[[Any], None] = lambda result: None,
-    **more: Any,
-) -> None:
-    """Make it and do what comes `then`; record beside it what making took, where nothing of it was there before."""
+def _finished(made: Path) -> bool:
+    return _record(made).is_file() and "unfinished" not in read_table(_record(made), COST)
+
+
+@contextmanager
+def _timed(made: Path, clock: Callable[[], float] = time.process_time, **more: Any) -> Iterator[Callable[[], None]]:
+    """Record beside what is made in the block how long it took to the last call of what this gives, which keeps it."""
     make_folder(made.parent)
-    whole, start = not made.exists(), clock()
-    result = make()
-    seconds = clock() - start
-    then(result)
-    write_table(_record(made), {"seconds": seconds if whole else None, **more}, COST)
+    record, start = _record(made), clock()
+    before = read_table(record, COST)["seconds"] if record.is_file() else None if made.exists() else 0.0
+    table = {"seconds": before, **more}
+
+    def keep() -> None:
+        table["seconds"] = None if before is None else before + clock() - start
+        write_table(record, table | {"unfinished": True}, COST)
+
+    keep()
+    yield keep
+    write_table(record, table, COST)

@@ -68,7 +68,7 @@ def test_depth_is_emulated_where_no_network_takes_the_place_of_emulated_maps(mov
 def test_long_runs_and_users_who_say_so_get_what_lies_between(
     moving, tmp_path, monkeypatch, iterations, tables, built
 ) -> None:
-    def stop(*_: object, between: bool) -> None:
+    def stop(*_: object, between: bool, on_view: object) -> None:
         raise D2Error(f"between: {between}")
 
     monkeypatch.setattr("d2_plugin.runs.run.build_priors_for", stop)

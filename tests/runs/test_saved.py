@@ -1,12 +1,14 @@
 """What a run keeps: a damaged file is one sentence, a run that diverged stops, a second writer is refused."""
 
 import io
+import itertools
 import math
 import shutil
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -16,7 +18,7 @@ from tiny import ALL_HOOKS, make_model, make_trainer
 
 from d2_plugin.backbones import model
 from d2_plugin.commands.cli import main
-from d2_plugin.durable import write_archive
+from d2_plugin.durable import read_table, write_archive, write_table
 from d2_plugin.errors import D2Error
 from d2_plugin.hooks.finite import Diverged
 from d2_plugin.locks import only_writer
@@ -25,7 +27,9 @@ from d2_plugin.runs.evaluation import renderer
 from d2_plugin.runs.run import Run
 from d2_plugin.runs.saved import load_checkpoint, read_metrics, save_checkpoint, watched, what_diverged
 from d2_plugin.runs.settings import RunSettings
+from d2_plugin.runs.shared import COST, share
 from d2_plugin.runs.start import TimedPoints
+from d2_plugin.store.store import PriorStore
 
 pytest.importorskip("cv2")
 
@@ -175,6 +179,36 @@ class TestThePriorOfARun:
         assert [refusal["frame"] for refusal in prior["refused"]] == [0, 1]
         assert main(["eval", str(tmp_path / "run"), "--no-images"]) == 0
         assert read_metrics(tmp_path / "run")["prior"] == prior
+
+    @pytest.fixture
+    def second(self, monkeypatch: pytest.MonkeyPatch) -> Mock:
+        """Called when the first of the two views is finished."""
+        second, write = Mock(), PriorStore.write
+        steps = itertools.cycle([lambda: None, second])
+        monkeypatch.setattr(PriorStore, "write", lambda *given: (next(steps)(), write(*given)))
+        return second
+
+    def test_time_of_finished_views_outlives_a_process_that_is_killed(self, scene, tmp_path, second) -> None:
+        settings = RunSettings(str(scene), ("train0",), hooks=("depth_loss",), accept_empty_prior=True)
+        run, left = Run(settings, tmp_path / "run"), tmp_path / "left"
+        second.side_effect = lambda: shutil.copytree(run.folder, left)  # a process that is killed leaves no more
+        run.prepare()
+        again = Run(settings, left)
+        assert 0 < again.seconds["priors"] < run.seconds["priors"]
+        assert 0 < again.cpu_seconds["priors"] < run.cpu_seconds["priors"]
+        before = again.seconds["priors"]
+        second.side_effect = None
+        again.prepare()
+        assert again.seconds["priors"] > before
+
+    def test_time_of_a_shared_one_is_that_of_all_its_parts(self, scene, tmp_path, second) -> None:
+        settings = RunSettings(str(scene), ("train0",))
+        second.side_effect = KeyboardInterrupt
+        with pytest.raises(KeyboardInterrupt):
+            share(settings, tmp_path)
+        points, first = (read_table(path, COST)["seconds"] for path in sorted(tmp_path.rglob("*.seconds.json")))
+        second.side_effect = None
+        assert share(settings, tmp_path).seconds > points + first
 
 
 def test_a_run_goes_on_from_the_checkpoint_before_one_that_cannot_be_written(scene, tmp_path, monkeypatch) -> None:

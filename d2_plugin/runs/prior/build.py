@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ import numpy as np
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.between import build_between
 from d2_plugin.priors.build import PriorSummary, build_priors
-from d2_plugin.progress import progress_bar
+from d2_plugin.progress import Bar, progress_bar
 from d2_plugin.runs.scene import Scene
 from d2_plugin.store.store import PriorStore
 
@@ -25,31 +25,32 @@ def build_priors_for(
     shard: tuple[int, int] | None = None,
     cluster: Mapping[str, Any] | None = None,
     between: bool = True,
+    on_view: Callable[[], None] = lambda: None,
 ) -> PriorSummary:
     """Build what is missing of the depth prior in `folder`; `points` [P, 3] bound the depths that are searched.
 
     `shard` (index from 0, count) builds one part, so that any scheduler can run the parts beside each other. `cluster`
     (`scheduler` or `workers`) hands the frames to dask.distributed instead. `between` makes the instants between the
-    frames as well, for the hook `motion`.
+    frames as well, for the hook `motion`. `on_view` is called after each finished view, or part of a cluster's work.
     """
+
+    def report(bar: Bar, done: int, total: int = 0, note: str = "") -> None:
+        bar.update(done, note)
+        on_view()
+
     with progress_bar("priors", len(scene.recording.frames) * len(scene.train_cameras)) as bar:
-
-        def report(done: int, total: int, note: str = "") -> None:
-            bar.update(done, note)
-
         if cluster is None:
             build = partial(build_priors, shard=shard)
         else:
             from d2_plugin.priors.dask_build import build_priors_on_cluster  # needs an extra
 
             build = partial(build_priors_on_cluster, **cluster)
-        summary = build(
-            *(scene.recording, scene.train_cameras, folder, scene.prior_settings), sparse_points=points, progress=report
-        )
+        given = scene.recording, scene.train_cameras, folder, scene.prior_settings
+        summary = build(*given, sparse_points=points, progress=partial(report, bar))
     if between and scene.prior_settings.between and scene.plan.uses("temporal") and shard is None:
         store = PriorStore.described(PriorStore.located(folder, scene.train_cameras))
         with progress_bar("between", len(store.cameras) * (len(store.frames) - 1)) as bar:
-            build_between(store, bar.update)
+            build_between(store, partial(report, bar))
     return summary
 
 

@@ -31,7 +31,7 @@ class Group(NamedTuple):
 
     @property
     def minutes(self) -> float:
-        """Of prior and training; NaN where nobody knows them, since making the prior was cut off."""
+        """Of prior and training; NaN where nobody timed the making of the prior."""
         known = [row for row in self.rows if row.get("prior_seconds", 0.0) is not None]
         return mean(row["seconds"] + row.get("prior_seconds", 0.0) for row in known) / 60 if known else math.nan
 
