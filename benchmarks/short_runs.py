@@ -1,6 +1,5 @@
 """What benchmarks of many short runs share: their settings, and measuring what is missing."""
 
-import itertools
 import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -9,10 +8,10 @@ from typing import Annotated, Literal
 
 from benchmarks.rows import told
 from d2_plugin.errors import D2Error
-from d2_plugin.progress import progress_bar
-from d2_plugin.runs.rows import Row, append_rows, read_rows
+from d2_plugin.runs.rows import Row
 from d2_plugin.runs.tables import Table
-from d2_plugin.runs.training.measured import Work, side_by_side
+from d2_plugin.runs.training import measured
+from d2_plugin.runs.training.measured import Work
 from d2_plugin.settings import AtATime, Count, Downscale, Positional, Settings
 
 
@@ -48,20 +47,5 @@ def measure_missing(
     """
     if not settings.recordings:
         raise D2Error(f"the benchmark {name} needs a recording with its cameras: write PATH@00+02+05+07")
-    known = {(row["case"], row["method"], row["fingerprint"]) for row in _rows(path)}
     works = [work for text in settings.recordings for work in works_of(text)]
-    missing = [work for work in works if (work.case, work.method, work.key[0]) not in known]
-    with progress_bar(f"bench {name}", len(missing)) as bar:
-        done = itertools.count(1)
-
-        def write(row: Row) -> None:
-            row["setting"] = row.get("change", row["setting"])
-            append_rows(path, [row])
-            bar.update(next(done), f"{row['case']}: {row['method']}, {row['setting']}")
-
-        side_by_side(missing, settings.jobs, write)
-    return told(tables(_rows(path)), path)
-
-
-def _rows(path: Path) -> list[Row]:
-    return read_rows([path]) if path.is_file() else []
+    return told(tables(measured.measure_missing(f"bench {name}", works, path, settings.jobs)), path)

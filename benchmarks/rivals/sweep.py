@@ -63,7 +63,7 @@ def _works(settings: RivalsSweep, text: str) -> Iterator[Work]:
         used = replace(case.settings, hooks=(), overrides=chosen.merged({}))
         used = used if guidance is None else replace(used, priors=str(shared.priors))
         folder = shared.folder / "sweep" / name / (change.replace(" ", "_").replace(",", "") or "alone")
-        about = (case.name, name, command, target, {"change": change})
+        about = (case.name, name, command, target, {"setting": change})
         yield Work(used, folder, shared.points, *about, kind="sweep", guidance=guidance)
 
 

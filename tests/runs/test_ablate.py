@@ -1,7 +1,10 @@
 """`d2 ablate`: the rows are the paper's, seeds are averaged, and a finished run is never repeated."""
 
 import json
-from pathlib import Path
+import os
+import shutil
+import signal
+from unittest.mock import Mock
 
 import pytest
 from at_once import measured_at_once
@@ -9,6 +12,7 @@ from refusals import refuses
 from stand_in_recordings import write_grey
 
 from d2_plugin.commands.cli import main
+from d2_plugin.durable import append
 from d2_plugin.runs.ablation.ablate import order_table, report, table
 from d2_plugin.runs.ablation.presets import PRESETS, TABLES, rows_named
 from d2_plugin.runs.settings import RunSettings, check
@@ -88,18 +92,26 @@ class TestTables:
         assert "holds" not in text.replace(EXPLANATION, "")
 
 
-def test_the_command_trains_shares_priors_and_repeats_nothing(saved_room, tmp_path: Path, refused) -> None:
+def test_the_command_trains_shares_priors_and_repeats_nothing(saved_room, tmp_path, refused, monkeypatch) -> None:
     pytest.importorskip("pycolmap", reason="pycolmap is in the `stereo` extra")
-    room = saved_room(cameras=2, held_out=1, frames=2, width=96, height=54)
+    room = shutil.copytree(saved_room(cameras=2, held_out=1, frames=2, width=96, height=54), tmp_path / "room")
     command = ["ablate", str(room), "--train-cameras", "train0,train1", "--rows", "main,no_pruning"]
     command += ["--seeds", "3", "--iterations", "8", "--jobs", "1", "--output", str(tmp_path / "out")]
+    written = tmp_path / "out" / "runs.jsonl"
+    with measured_at_once(), monkeypatch.context() as patch:
+        stopped = Mock(side_effect=lambda *given: (append(*given), os.kill(os.getpid(), signal.SIGINT)))
+        patch.setattr("d2_plugin.runs.rows.append", stopped)
+        assert main(command) == 130
+        first = written.read_text()
+        assert first.count("\n") == 1
     with measured_at_once():
         assert main(command) == 0
+    assert written.read_text().startswith(first)
     table = (tmp_path / "out" / "ablation.md").read_text()
     assert "| Backbone |" in table
     assert "| w/o Pruning |" in table
     assert {path.name for path in (tmp_path / "out" / "priors").iterdir()} == {"dual", "dual.seconds.json"}, "one"
-    rows = [json.loads(line) for line in (tmp_path / "out" / "runs.jsonl").read_text().splitlines()]
+    rows = [json.loads(line) for line in written.read_text().splitlines()]
     assert len(rows) == 3
     assert all(row["kind"] == "ablation" and row["error"] > 0 for row in rows)
     assert [row["prior_seconds"] > 0 for row in rows] == [False, True, True]
@@ -108,6 +120,7 @@ def test_the_command_trains_shares_priors_and_repeats_nothing(saved_room, tmp_pa
     with measured_at_once():
         assert main(command) == 0
     assert {path: path.stat().st_mtime_ns for path in checkpoints} == checkpoints
+    assert [json.loads(line) for line in written.read_text().splitlines()] == rows
     assert "another run" in refused(*command, "--iterations", "9")
     for path in (room / "images" / "train0").iterdir():
         write_grey(path, 99, (96, 54))  # another recording in a folder of the same name

@@ -94,6 +94,11 @@ class TestPlan:
         assert [(row["method"], row["seed"]) for row in more] == [("yang4d backbone", 2), ("yang4d full", 2)]
         assert len(bench(first[:-1], seconds=(10,), seeds=(0, 1))) == 1
 
+    def test_the_same_settings_under_a_label_are_measured_as_well(self) -> None:
+        first = bench([], seconds=(10,), seeds=(0,))
+        labelled = bench(first, seconds=(10,), seeds=(0,), label="mine")
+        assert [row["method"] for row in labelled] == [f"{row['method']}, mine" for row in first]
+
     def test_steps_need_no_try_and_seconds_are_the_default(self) -> None:
         rows = bench([], steps=(70, 20), seeds=(5,))
         assert [row["iterations"] for row in rows if row["method"] == "yang4d backbone"] == [20, 70]

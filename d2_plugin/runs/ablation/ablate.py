@@ -7,13 +7,12 @@ from dataclasses import replace
 from pathlib import Path
 
 from d2_plugin.durable import write_text
-from d2_plugin.progress import progress_bar
 from d2_plugin.runs.ablation.presets import PRESETS, PUBLISHED, TABLES, Preset
-from d2_plugin.runs.rows import Row, as_line, case_name
+from d2_plugin.runs.rows import Row, case_name
 from d2_plugin.runs.settings import RunSettings, prior_settings
 from d2_plugin.runs.shared import Shared, share, share_points
 from d2_plugin.runs.tables import STUDY_COLUMNS, Table, markdown
-from d2_plugin.runs.training.measured import Work, side_by_side
+from d2_plugin.runs.training.measured import Work, by_key, measure_missing
 from d2_plugin.runs.verdict import EXPLANATION, estimated, seeds_in_words, verdicts_table
 
 MARK = "○"
@@ -31,8 +30,8 @@ def ablate(
 ) -> str:
     """Train and score what is not finished, `workers` runs at a time with one thread each; returns the tables.
 
-    Priors and starting points are made once under `output`, before the runs that share them start. Writes ablation.md
-    and one row per run in runs.jsonl.
+    Priors and starting points are made once under `output`, before the runs that share them start. Writes ablation.md,
+    and in runs.jsonl one row per run as soon as it is finished.
 
     `base` gives recording, cameras, iterations and the user's own tables, and `command`, for the rows, is how this was
     started. Runs with the same variant of the prior share one.
@@ -44,18 +43,9 @@ def ablate(
         for preset in presets
         for seed in seeds
     ]
-    rows: dict[tuple[str, str], Row] = {}
-    with progress_bar("ablate", len(works)) as bar:
-
-        def note(row: Row) -> None:
-            rows[row["fingerprint"], row["method"]] = row
-            bar.update(len(rows), f"{row['method']}, {row['setting']}")
-
-        side_by_side(works, workers, note)
-    ordered = [rows[work.key[0], work.method] for work in works]
-    text = report(ordered, presets)
+    rows = by_key(measure_missing("ablate", works, output / "runs.jsonl", workers))
+    text = report([rows[work.key] for work in works], presets)
     write_text(output / "ablation.md", text)
-    write_text(output / "runs.jsonl", "".join(map(as_line, ordered)))
     return text
 
 

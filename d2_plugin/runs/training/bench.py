@@ -18,14 +18,13 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
 from d2_plugin.errors import D2Error
-from d2_plugin.progress import progress_bar
 from d2_plugin.reading import read_toml
 from d2_plugin.recordings.presets import resolve_cameras, split_name
 from d2_plugin.runs.ablation.presets import PRESETS, TABLES, Preset, rows_named
-from d2_plugin.runs.rows import TRY, Row, append_rows, case_name, command_line, read_rows
+from d2_plugin.runs.rows import TRY, Row, case_name, command_line
 from d2_plugin.runs.settings import RunSettings
 from d2_plugin.runs.shared import Shared, share, share_points
-from d2_plugin.runs.training.measured import Line, Work, follow, workers
+from d2_plugin.runs.training.measured import Line, Work, by_key, follow, rows_in, workers, written
 from d2_plugin.settings import AtATime, Count, Downscale, Positional, Range, Seed, Settings
 
 PILOT = 100
@@ -98,19 +97,13 @@ def run(
     if not settings.recordings:
         raise D2Error(f"{name} needs a recording with its cameras: write PATH@00+02+05+07")
     path = settings.output / "training.jsonl"
-    known = read_rows([path]) if path.is_file() else []
+    known = rows_in(path)
     chosen = rows_named(settings.methods, presets, tables)
     command = command_line(name, settings)
     with workers(settings.jobs, settings.scheduler) as submit:  # or say that nobody answers, before priors are made
         lines = [line for text in settings.recordings for line in _lines(settings, text, chosen, known, command)]
-        with progress_bar(name, len(lines) * len(settings.seeds) * len(_targets(settings))) as bar:
-            done: list[Row] = []
-
-            def write(row: Row) -> None:
-                append_rows(path, [{**row, **(about or {})}])
-                done.extend([row] if row["target"] != TRY else [])  # a run that finds a length is beside the count
-                bar.update(len(done), f"{row['case']}: {row['method']}, {row['setting']}")
-
+        runs = len(lines) * len(settings.seeds) * len(_targets(settings))
+        with written(path, name, runs, **(about or {})) as write:
             follow(lines, submit, write)
     return f"rows are in {path}; `d2 report {path}` draws them"
 
@@ -178,7 +171,7 @@ def _lines(
 def line_of(method: Method, known: Sequence[Row]) -> Line:
     """All targets of one method: the length of a run is tried with the first seed, then the other seeds follow."""
     settings, case = method.settings, method.case
-    by_run = {(row["fingerprint"], row["target"]): row for row in known if row["kind"] == "quality"}
+    by_run = by_key(known)
     trained = list(case.settings.train_cameras)
     mine = [
         row

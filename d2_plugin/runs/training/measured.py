@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import itertools
 import queue
 import shutil
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
 from d2_plugin.durable import CannotWrite
 from d2_plugin.errors import D2Error
 from d2_plugin.locks import Busy
-from d2_plugin.runs.rows import Row, make_row, rms_error
+from d2_plugin.progress import progress_bar
+from d2_plugin.runs.rows import TRY, Row, append_rows, make_row, read_rows, rms_error
 from d2_plugin.runs.run import Run
 from d2_plugin.runs.saved import read_metrics
 from d2_plugin.runs.scene import Guidance
@@ -45,9 +48,9 @@ class Work:
     """Whether the checkpoint stays once the run is scored, and the first seed gets images."""
 
     @property
-    def key(self) -> tuple[str, str]:
+    def key(self) -> tuple[str, ...]:
         """What makes two of them the same measurement, on whatever machine its files lie."""
-        return fingerprint(self), self.target
+        return self.kind, self.method, self.target, fingerprint(self)
 
     def run(self) -> Run:
         """The run in its folder; refuses a folder of other settings, with one sentence."""
@@ -111,7 +114,7 @@ def _row(work: Work, metrics: Mapping[str, Any] | None, failed: str | None = Non
         work.kind,
         work.case,
         work.method,
-        f"{settings.iterations} steps, seed {settings.seed}",
+        about.pop("setting", f"{settings.iterations} steps, seed {settings.seed}"),
         error=error,
         seconds=None if metrics is None else metrics["cpu_seconds"]["train"],
         failed=failed,
@@ -163,14 +166,42 @@ def follow(lines: Sequence[Line], submit: Submit, on_row: Callable[[Row], None])
             resume(line, rows)
 
 
-def side_by_side(works: Sequence[Work], jobs: int, on_row: Callable[[Row], None]) -> None:
-    """Measure all of them, `jobs` at a time on this machine."""
+def measure_missing(name: str, works: Sequence[Work], path: Path, jobs: int) -> list[Row]:
+    """Measure what has no row in the file yet, `jobs` at a time on this machine; all rows of the file."""
+    known = by_key(rows_in(path))
+    missing = [work for work in works if work.key not in known]
 
     def line() -> Line:
-        yield works
+        yield missing
 
-    with workers(jobs, None) as submit:
-        follow([line()], submit, on_row)
+    with workers(jobs, None) as submit, written(path, name, len(missing)) as write:
+        follow([line()], submit, write)
+    return rows_in(path)
+
+
+def rows_in(path: Path) -> list[Row]:
+    """The rows of a file that need not be there."""
+    return read_rows([path]) if path.is_file() else []
+
+
+def by_key(rows: Iterable[Row]) -> dict[tuple[str, ...], Row]:
+    """Rows of runs by `Work.key`."""
+    key = itemgetter("kind", "method", "target", "fingerprint")
+    return {key(row): row for row in rows if "fingerprint" in row}
+
+
+@contextmanager
+def written(path: Path, name: str, total: int, **about: Any) -> Iterator[Callable[[Row], None]]:
+    """Gives what adds a row to the file, with further fields, and shows it as one of so many."""
+    with progress_bar(name, total) as bar:
+        done = itertools.count(1)
+
+        def write(row: Row) -> None:
+            append_rows(path, [row | about])
+            if row["target"] != TRY:  # a run that finds a length is beside the count
+                bar.update(next(done), f"{row['case']}: {row['method']}, {row['setting']}")
+
+        yield write
 
 
 @contextmanager
