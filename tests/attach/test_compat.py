@@ -160,9 +160,22 @@ class TestNearest:
         elif kind == "repeated":
             points[count // 2 :] = points[: count - count // 2]
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("d2_plugin.gaussians.nearest.PAIRS", 64)  # in several parts
+            patch.setattr("d2_plugin.gaussians.nearest.GROUP", 8)  # in several parts
             result = nearest.distCUDA2(torch.from_numpy(points))
         np.testing.assert_allclose(result, self.brute(points.astype(np.float64)), rtol=1e-6, atol=1e-12)
+
+    @pytest.mark.parametrize("size", [1e-25, 1.0, 1e25], ids=["vanishing squares", "usual", "infinite squares"])
+    def test_distances_are_those_of_all_pairs_and_few_are_looked_at(self, size: float, monkeypatch) -> None:
+        points = torch.rand(3000, 3, generator=torch.Generator().manual_seed(0))
+        points[::300] *= 1e5
+        points *= size
+        cdist, looked = torch.cdist, []
+        monkeypatch.setattr(torch, "cdist", lambda a, b, **how: (looked.append(len(a) * len(b)), cdist(a, b, **how))[1])
+        distances, indices = nearest.nearest(points, points, 4)
+        every = cdist(points, points, compute_mode="donot_use_mm_for_euclid_dist")
+        assert torch.equal(distances, every.topk(4, largest=False).values)
+        assert torch.equal(distances, every.gather(1, indices))
+        assert size != 1 or sum(looked) < every.numel() / 3
 
     def test_one_point_or_none_has_no_distance(self) -> None:
         assert nearest.distCUDA2(torch.rand(1, 3)).tolist() == [0.0]
@@ -386,7 +399,7 @@ class TestKinematic:
 
 def test_nearest_points_are_those_of_all_distances(monkeypatch: pytest.MonkeyPatch) -> None:
     """By pytorch3d's knn and by faiss on a GPU."""
-    monkeypatch.setattr("d2_plugin.gaussians.nearest.PAIRS", 100)  # in several parts
+    monkeypatch.setattr("d2_plugin.gaussians.nearest.GROUP", 8)  # in several parts
     points, queries = torch.rand(2, 50, 3, generator=torch.Generator().manual_seed(0))
     distances = torch.cdist(queries, points)
     index = nearest.GpuIndexFlatL2(nearest.StandardGpuResources(), 3)
