@@ -54,7 +54,7 @@ EXACT = 0.15
 """Largest sigma of the depth that places a region in the world."""
 
 
-def build_between(store: PriorStore, progress: Callable[[int], None] | None = None) -> int:
+def build_between(store: PriorStore, progress: Callable[[int], None] = lambda done: None) -> int:
     """Make what is missing of the instants between those of a store; after how many views they were made now.
 
     Nothing is made while a prior is missing, or where there are fewer than three frames. `progress` is called with the
@@ -84,8 +84,7 @@ def build_between(store: PriorStore, progress: Callable[[int], None] | None = No
                     record = {"key": key, "next": second, "shares": seen.shares()}
                     store.write(camera.name, first, seen, record, store.between[quarter])
                 done += 1
-                if progress is not None:
-                    progress(done)
+                progress(done)
     return done
 
 

@@ -48,7 +48,7 @@ def build_priors(
     settings: PriorSettings,
     *,
     sparse_points: np.ndarray | None = None,
-    progress: Progress | None = None,
+    progress: Progress = lambda done, total, note: None,
     shard: tuple[int, int] | None = None,
 ) -> PriorSummary:
     """Build what is missing of the priors of `cameras` in the store at `output`.
@@ -88,9 +88,7 @@ def build_priors(
                 record = store.record(name, number) or {}
                 summary.add(name, number, record, built)
                 done += 1
-                if progress is not None:
-                    share = f"{record['shares']['verified']:.0%} verified"
-                    progress(done, total, f"camera {name}, frame {number}: {share}")
+                progress(done, total, f"camera {name}, frame {number}: {record['shares']['verified']:.0%} verified")
     return summary
 
 

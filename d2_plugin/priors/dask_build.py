@@ -40,7 +40,7 @@ def build_priors_on_cluster(
     scheduler: str | None = None,
     workers: int = 2,
     sparse_points: np.ndarray | None = None,
-    progress: Progress | None = None,
+    progress: Progress = lambda done, total, note: None,
 ) -> PriorSummary:
     """`build_priors`, on many machines or on several processes of this one; the store is the same, byte for byte.
 
@@ -73,7 +73,7 @@ def build_priors_on_cluster(
         return _joined(parts, len(recording.frames) * len(cameras), progress)
 
 
-def _joined(parts: list[Any], total: int, progress: Progress | None) -> PriorSummary:
+def _joined(parts: list[Any], total: int, progress: Progress) -> PriorSummary:
     """The summary of all parts, in the order in which they end; the first error ends all of them."""
     from distributed import KilledWorker, as_completed
 
@@ -88,8 +88,7 @@ def _joined(parts: list[Any], total: int, progress: Progress | None) -> PriorSum
             ) from None
         summary.add_part(part)
         done += part.built + part.kept
-        if progress is not None:
-            progress(done, total, f"a part of {part.built + part.kept} images")
+        progress(done, total, f"a part of {part.built + part.kept} images")
     return summary
 
 

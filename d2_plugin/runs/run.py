@@ -256,13 +256,10 @@ class Run:
     @contextmanager
     def _timed(self, name: str) -> Iterator[Callable[[], None]]:
         """Count the time of the block; what it gives counts and keeps what went by so far."""
-        last = time.monotonic(), time.process_time()
+        start, cpu = self.seconds[name] - time.monotonic(), self.cpu_seconds[name] - time.process_time()
 
         def keep() -> None:
-            nonlocal last
-            before, last = last, (time.monotonic(), time.process_time())
-            self.seconds[name] += last[0] - before[0]
-            self.cpu_seconds[name] += last[1] - before[1]
+            self.seconds[name], self.cpu_seconds[name] = start + time.monotonic(), cpu + time.process_time()
             if self._checkpoint.exists():  # which says it from now on
                 self._spent.unlink(missing_ok=True)
             else:  # until then a run that is cut off would forget it
