@@ -18,7 +18,7 @@ from tiny import ALL_HOOKS, make_model, make_trainer
 
 from d2_plugin.backbones import model
 from d2_plugin.commands.cli import main
-from d2_plugin.durable import read_table, write_archive, write_table
+from d2_plugin.durable import read_table, write_archive
 from d2_plugin.errors import D2Error
 from d2_plugin.hooks.finite import Diverged
 from d2_plugin.locks import only_writer
