@@ -21,7 +21,7 @@ from d2_plugin.recordings.recording import Camera
 from d2_plugin.store.files import Entry, EntryFolder, hash_of
 from d2_plugin.store.maps import SIGMA, DepthRange, encode_sigma
 
-VERSION = 12  # raise it when a matcher or the filter changes what it returns, so that caches are not trusted
+VERSION = 13  # raise it when a matcher or the filter changes what it returns, so that caches are not trusted
 
 STEREO_DTYPE = np.dtype([("depth", "<u2"), ("sigma", "u1")])
 """Geometric depth as it is stored, pixel by pixel: logarithms, in 16 and in 8 bits. Matches that nobody confirms stand

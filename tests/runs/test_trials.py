@@ -78,15 +78,16 @@ def test_where_a_network_adds_nothing_stereo_alone_is_used() -> None:
         (-0.004, 3.9, "all"),
         (-0.004, 2.5, "stereo"),
         (0.004, 2.5, "stereo"),
-        (-0.006, 3.9, "stereo"),
-        (0.006, 0.0, "all"),
+        (-0.007, 4.1, "all"),
+        (-0.011, 3.9, "stereo"),
+        (0.011, 0.0, "all"),
     ],
 )
 def test_in_a_tie_the_maps_are_used_where_they_are_good(ahead: float, gain: float, choice: str) -> None:
-    """*studio* with every second instant, and *dome* 02 07 22: level in trials, not after 2000 steps."""
+    """*studio* and *dome* 02 07 22: level in trials, not after 2000 steps."""
     trials = Trials({"a": GOOD + ahead}, {"a": GOOD}, gain, 1.0)
     assert trials.choice == choice
-    assert ("trials are level, and depth is" in str(trials)) == (abs(ahead) < 0.005)
+    assert ("trials are level, and depth is" in str(trials)) == (abs(ahead) < 0.01)
 
 
 @pytest.mark.parametrize(("ahead", "asked"), [(0.015, 4), (0.025, 2)])

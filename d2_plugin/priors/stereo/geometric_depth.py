@@ -1,7 +1,8 @@
-"""Geometric depth of one timestamp: match at two sizes, filter each, bring back to full size.
+"""Geometric depth of one timestamp: match at three sizes, filter each, bring back to full size.
 
-A wall with little texture says nothing in a window of eleven pixels, and more at half the size. What is left empty at
-the chosen size is filled with what passes the same filter at half of it, and is declared less exact."""
+What is small, an arm or what is far away, is lost in the windows of matching and of the filter, of eleven and nineteen
+pixels: so images are matched at twice the size first. A wall with little texture says nothing in such a window, and
+more at half the size. What is left empty at one size is filled with what passes the same filter at the next."""
 
 from __future__ import annotations
 
@@ -23,9 +24,9 @@ from d2_plugin.recordings.recording import Camera
 
 LUMA = np.array([0.299, 0.587, 0.114], np.float32)  # ITU-R BT.601, as every codec of the recordings uses
 
-SCALES = (1, 2)
+SCALES = (0.5, 1, 2)
 """Images are matched at this many times fewer pixels each way in turn; a later one fills what the earlier leave empty.
-At a quarter of the size edges fatten."""
+At a quarter of the size edges fatten; three times as large takes three times as long for little more."""
 
 
 def geometric_depth(
@@ -54,12 +55,12 @@ def geometric_depth(
     grays = [gray(image) for image in images]
     by_scale = []
     for scale, memory in zip(SCALES, memories or repeat(None)):
-        shrunk = [_shrunk(*view, settings.max_pixels, scale) for view in zip(grays, cameras)]
-        small, small_cameras = zip(*shrunk)
-        filtered = _matched(small, small_cameras, depth_range, settings, memory, scale)
-        tolerance = RELATIVE_DEPTH * scale
+        resized = [_resized(*view, settings.max_pixels, scale) for view in zip(grays, cameras)]
+        small, small_cameras = zip(*resized)
+        tolerance = RELATIVE_DEPTH * max(scale, 1)
+        filtered = _matched(small, small_cameras, depth_range, settings, memory, tolerance)
         by_scale.append(
-            [enlarged(one, camera.width, camera.height, tolerance) for one, camera in zip(filtered, cameras)]
+            [brought(one, camera.width, camera.height, tolerance) for one, camera in zip(filtered, cameras)]
         )
     return [_filled(results) for results in zip(*by_scale)]
 
@@ -70,7 +71,7 @@ def _matched(
     depth_range: tuple[float, float],
     settings: StereoSettings,
     memory: MatchMemory | None,
-    scale: int,
+    tolerance: float,
 ) -> list[GeometricDepth]:
     """Filtered depth at one size; what did not change since the frame before is not matched again."""
     wanted = None if memory is None else memory.wanted(grays)
@@ -79,7 +80,7 @@ def _matched(
     if memory is not None:
         raw = memory.merge(grays, raw, wanted)
     depths, costs = zip(*raw)
-    return filter_depths(grays, cameras, depths, costs, settings, RELATIVE_DEPTH * scale)
+    return filter_depths(grays, cameras, depths, costs, settings, tolerance)
 
 
 def _filled(results: Sequence[GeometricDepth]) -> GeometricDepth:
@@ -98,23 +99,24 @@ def gray(image: np.ndarray) -> np.ndarray:
     return np.rint(image.astype(np.float32) @ LUMA).astype(np.uint8)
 
 
-def _shrunk(gray: np.ndarray, camera: Camera, max_pixels: int, scale: int) -> tuple[np.ndarray, Camera]:
+def _resized(gray: np.ndarray, camera: Camera, max_pixels: int, scale: float) -> tuple[np.ndarray, Camera]:
     """Image and camera at the largest of full, half, a third, ... of the size that has at most `max_pixels`, and
     `scale` times smaller."""
     divisor = scale * math.ceil(math.sqrt(gray.size / max(max_pixels, 1)))
-    if divisor <= 1:
+    if divisor == 1:
         return gray, camera
     cv2 = opencv("matching at another resolution")
     width, height = max(1, round(camera.width / divisor)), max(1, round(camera.height / divisor))
-    small = cv2.resize(gray, (width, height), interpolation=cv2.INTER_AREA)
-    return small, scaled_camera(camera, width, height)
+    resized = cv2.resize(gray, (width, height), interpolation=cv2.INTER_AREA if divisor > 1 else cv2.INTER_CUBIC)
+    return resized, scaled_camera(camera, width, height)
 
 
-def enlarged(result: GeometricDepth, width: int, height: int, tolerance: float = RELATIVE_DEPTH) -> GeometricDepth:
+def brought(result: GeometricDepth, width: int, height: int, tolerance: float = RELATIVE_DEPTH) -> GeometricDepth:
     """The maps at another size: inverse depth, which is linear over a plane, is interpolated between four neighbours.
 
     Where they differ by more than twice `tolerance`, or one is missing, nothing is known: an interpolated value would
-    hang between two surfaces.
+    hang between two surfaces. Sigma of maps that are larger grows by the root of how many times as wide they are:
+    pixels that were made are not as independent as the filter takes them for.
     """
     if result.depth.shape == (height, width):
         return result
@@ -134,7 +136,8 @@ def enlarged(result: GeometricDepth, width: int, height: int, tolerance: float =
 
     row, column = np.where(row_share < 0.5, rows[0], rows[1]), np.where(column_share < 0.5, columns[0], columns[1])
     depth = interpolated(result.depth)
-    sigma = np.where(depth > 0, result.sigma[row][:, column], np.float32(np.inf))
+    made = np.float32(math.sqrt(max(result.depth.shape[1] / width, 1)))
+    sigma = np.where(depth > 0, made * result.sigma[row][:, column], np.float32(np.inf))
     return replace(result, depth=depth, sigma=sigma, unconfirmed=interpolated(result.unconfirmed))
 
 

@@ -53,8 +53,9 @@ MOST_LEFT_OUT = 2
 """Cameras that are left out, spread evenly in the order in which they are named."""
 CLEAR = 0.02
 """A difference of SSIM at one left-out camera that needs no second one."""
-TIE = 0.005
-"""A mean difference of SSIM below which it does not decide, but how good the maps are where stereo was left out."""
+TIE = 0.01
+"""A mean difference of SSIM below which it does not decide, but how good the maps are where stereo was left out: with
+other draws of the matching the same prior's differs by half of that."""
 GOOD_MAPS = 3.0
 """Then they are used if depth is so many times as far off there without them."""
 
