@@ -64,6 +64,29 @@ def test_half_the_size_fills_what_the_full_size_leaves_empty(pair, matched, monk
         assert np.median(one.sigma[filled]) > np.median(one.sigma[known])
 
 
+def test_what_is_small_is_found_at_twice_the_size(monkeypatch) -> None:
+    """Squares of 14 pixels before a wall, both textured: the window of the filter's coherence, 19 pixels, holds more of
+    the wall than of them."""
+    rng, squares = np.random.default_rng(0), np.zeros((160, 280), bool)
+    for row, column in np.ndindex(4, 6):
+        squares[20 + 32 * row :, 40 + 32 * column :][:14, :14] = True
+    cv2 = pytest.importorskip("cv2")
+    wall, front = (128 + 214 * cv2.GaussianBlur(rng.standard_normal(squares.shape), (0, 0), 1) for _ in range(2))
+    views = [
+        np.where(squares[:, near : near + 240], front[:, near : near + 240], wall[:, far : far + 240])
+        for near, far in ((0, 0), (12, 4))
+    ]
+    images = [np.repeat(np.rint(view).clip(0, 255).astype(np.uint8)[..., None], 3, -1) for view in views]
+    cameras = [camera_at((x, 0, 0), size=(240, 160), focal=200) for x in (0, 1)]
+    matching = replace(SETTINGS, min_angle=0.1)
+    depth = geometric_depth(images, cameras, (8, 100), matching)[0].depth[squares[:, :240]]
+    monkeypatch.setattr("d2_plugin.priors.stereo.geometric_depth.SCALES", (1, 2))
+    before = geometric_depth(images, cameras, (8, 100), matching)[0].depth[squares[:, :240]]
+    assert np.mean(np.abs(depth / (200 / 12) - 1) < 0.02) > 0.15
+    assert np.mean(np.abs(depth[depth > 0] / (200 / 12) - 1) > 0.05) < 0.05
+    assert np.mean(before > 0) < 0.02
+
+
 def geometric(depth: np.ndarray) -> GeometricDepth:
     """One view's depth with a sigma of one per cent."""
     return GeometricDepth(depth, np.where(depth > 0, 0.01, np.inf).astype(np.float32), np.zeros_like(depth), {})
@@ -85,6 +108,8 @@ def test_enlarging_a_plane_is_exact_and_an_edge_is_left_out() -> None:
     assert not brought(geometric(hole), 60, 40).depth[20:22, 10:12].any()
     np.testing.assert_array_equal(np.isfinite(edge.sigma), edge.depth > 0)
     np.testing.assert_array_equal(edge.sigma[edge.depth > 0], np.float32(0.01))
+    back = brought(large, 30, 20, tolerance=0.05)  # of pixels that were made, which are no further evidence
+    np.testing.assert_allclose(back.sigma[back.depth > 0], 0.01 * 2**0.5, rtol=1e-6)
 
 
 def test_the_depth_range_comes_from_points_then_the_data_set_then_the_baselines(pair: Recording) -> None:
