@@ -2,8 +2,9 @@
 
 Each pixel carries a plane, linear in inverse depth over the image, and keeps the best of what it draws at random and
 of what its neighbours found (`kernels/spread.h`). Resolution doubles from level to level, and planes are carried
-over exactly. After each level views hand their planes to one another, as in PatchMatch Stereo (Bleyer and others,
-2011). In the end each plane has fitted the noise of its own window; averaging those that agree takes that out.
+over exactly. After each level but the last, where it takes as long as all else and finds hardly more, views hand their
+planes to one another, as in PatchMatch Stereo (Bleyer and others, 2011). In the end each plane has fitted the noise of
+its own window; averaging those that agree takes that out.
 Coordinates are array indices, as in `d2_plugin.priors.geometry`.
 """
 
@@ -71,7 +72,8 @@ def patchmatch(
             same = coarse is not None and coarse.gray.shape == view.gray.shape  # too small for the level before
             # At full size random planes are hardly ever better than those handed down.
             kernel.match(views, index, level, 1 if same else rounds, not same and (divisor > 1 or level == 0))
-        _exchange(kernel, views, sources, len(ROUNDS) + level)
+        if divisor > 1:
+            _exchange(kernel, views, sources, len(ROUNDS) + level)
     for view in views:
         kernel.average(view)
     return [(plane_depth(view), view.cost) for view in views]
