@@ -88,7 +88,7 @@ def test_priors_are_built_in_parts_and_shown_on_a_sheet(
     told = answered(*build)
     assert "verified" in told
     assert "held against the true depth of" in told
-    assert "here monocular depth is" in told, "what left-out cameras showed, for every trainer that reads this prior"
+    assert "here monocular depth " in told, "what left-out cameras showed, for every trainer that reads this prior"
     assert PriorStore.open(tmp_path).tried()["text"] in told
     assert (tmp_path / "contact_sheet.png").is_file()
     whole, joined = PriorStore.open(finished / "priors"), PriorStore.open(tmp_path)

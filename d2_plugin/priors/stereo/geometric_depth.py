@@ -115,8 +115,8 @@ def brought(result: GeometricDepth, width: int, height: int, tolerance: float = 
     """The maps at another size: inverse depth, which is linear over a plane, is interpolated between four neighbours.
 
     Where they differ by more than twice `tolerance`, or one is missing, nothing is known: an interpolated value would
-    hang between two surfaces. Sigma of maps that are larger grows by the root of how many times as wide they are:
-    pixels that were made are not as independent as the filter takes them for.
+    hang between two surfaces. Sigma of maps that are larger grows by how many times as wide they are: a match is no
+    more exact, in pixels of the image, for pixels that were made of it.
     """
     if result.depth.shape == (height, width):
         return result
@@ -136,7 +136,7 @@ def brought(result: GeometricDepth, width: int, height: int, tolerance: float = 
 
     row, column = np.where(row_share < 0.5, rows[0], rows[1]), np.where(column_share < 0.5, columns[0], columns[1])
     depth = interpolated(result.depth)
-    made = np.float32(math.sqrt(max(result.depth.shape[1] / width, 1)))
+    made = np.float32(max(result.depth.shape[1] / width, 1))
     sigma = np.where(depth > 0, made * result.sigma[row][:, column], np.float32(np.inf))
     return replace(result, depth=depth, sigma=sigma, unconfirmed=interpolated(result.unconfirmed))
 
