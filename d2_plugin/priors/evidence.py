@@ -7,7 +7,7 @@ A mono-only pixel is a point in space that other cameras may see.
   own, and without the network it has no depth.
 - Where two cameras' monocular depths meet and the colours are alike, each confirms the other as far as their errors
   are independent, which is not far: both were bent by anchors of one scene, and one network errs alike in both. So
-  agreement takes a third off sigma and no more; where sigma is infinite, as in a sky, it stays so.
+  agreement takes nearly half off sigma and no more; where sigma is infinite, as in a sky, it stays so.
 - Where others see the place and none of them has a surface there, one of them is wrong: sigma grows.
 """
 
@@ -23,7 +23,7 @@ from d2_plugin.recordings.images import opencv
 from d2_plugin.recordings.recording import Camera
 from d2_plugin.store.maps import FusedPrior
 
-AGREED = 0.7
+AGREED = 0.57
 """Factor of sigma where another camera's monocular depth agrees and the colours are alike. What a heavy tail added to
 sigma falls away there: agreement is evidence that this is not one of the things that the map misses."""
 AT_BEST = 0.01

