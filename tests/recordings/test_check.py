@@ -109,7 +109,7 @@ def test_too_little_memory_is_said_before_work_begins(room: Recording, monkeypat
     names = list(room.cameras)[:2]
     assert 7 < needed_bytes(large, names) / 2**30 < 9, "7.4 GiB were measured for two images of 8000x4500"
     monkeypatch.setattr(memory_module, "available_bytes", lambda: 4 << 30)
-    refuses(r"2 cameras of 8000x4500 pixels need about 7\.\d GiB .* use --downscale 2", check_memory, large, names)
+    refuses(r"2 cameras of 8000x4500 pixels need about 8\.\d GiB .* use --downscale 2", check_memory, large, names)
     check_memory(room, names)
     monkeypatch.setattr(memory_module, "available_bytes", lambda: 1 << 20)
     refuses("a machine with more memory", check_memory, large, names)

@@ -12,6 +12,7 @@ from d2_plugin.errors import D2Error
 from d2_plugin.recordings.recording import Recording
 
 BYTES_PER_PIXEL = 110  # of every training camera, at the peak of building its prior or of rendering it
+BYTES_PER_MATCH, MOST_MATCHES = 70, 2_000_000  # of pixels that stereo matches at once, and how many of a camera
 BASE_BYTES = 1 << 29  # what Python, torch and the Gaussians take whatever the size of the images
 SCALES = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64)  # what is proposed for `--downscale`
 
@@ -19,8 +20,9 @@ SCALES = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64)  # what is proposed for `--down
 def needed_bytes(recording: Recording, cameras: Sequence[str], downscale: int = 1) -> int:
     """Estimate of the peak memory of priors and training on the named cameras, all of one instant at a time."""
     chosen = [recording.cameras[name] for name in cameras]
-    pixels = sum((camera.width // downscale) * (camera.height // downscale) for camera in chosen)
-    return BASE_BYTES + BYTES_PER_PIXEL * pixels
+    pixels = [(camera.width // downscale) * (camera.height // downscale) for camera in chosen]
+    matched = sum(min(count, MOST_MATCHES) for count in pixels)
+    return BASE_BYTES + BYTES_PER_PIXEL * sum(pixels) + BYTES_PER_MATCH * matched
 
 
 def available_bytes() -> int | None:
