@@ -38,7 +38,8 @@ class StereoSettings(Settings):
     """Where the depth on disk lies, relative to the recording; `{frame}` (as in `mvs/{frame:05d}`) stands for the frame
     number. Where empty: `depth` for `sensor`, `colmap/FRAME`, `colmap` or `dense` for `workspace`."""
     max_pixels: Annotated[int, Range(1, 1 << 28, unit="pixels")] = 500_000
-    """Images with more pixels are matched at a half, a third, ... of their size; depth comes back at full size."""
+    """Images with more pixels are matched at a half, a third, ... of their size, and all at twice that first; depth
+    comes back at full size."""
     patchmatch_device: Literal["auto", "cuda", "cpu"] = "auto"
     """Where patchmatch runs: `auto` takes the GPU where torch sees one. Both return the same depth."""
     patchmatch_sources: Annotated[int, Range(1, 32)] = 4
