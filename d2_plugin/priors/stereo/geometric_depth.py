@@ -26,7 +26,7 @@ LUMA = np.array([0.299, 0.587, 0.114], np.float32)  # ITU-R BT.601, as every cod
 
 SCALES = (0.5, 1, 2)
 """Images are matched at this many times fewer pixels each way in turn; a later one fills what the earlier leave empty.
-At a quarter of the size edges fatten; three times as large takes three times as long for little more."""
+At a quarter of the size edges fatten; three times the size finds a little more of what moves in twice the time."""
 
 
 def geometric_depth(

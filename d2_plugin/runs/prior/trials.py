@@ -54,8 +54,8 @@ MOST_LEFT_OUT = 2
 CLEAR = 0.02
 """A difference of SSIM at one left-out camera that needs no second one."""
 TIE = 0.01
-"""A mean difference of SSIM below which it does not decide, but how good the maps are where stereo was left out: with
-other draws of the matching the same prior's differs by half of that."""
+"""A mean difference of SSIM below which it does not decide, but how good the maps are where stereo was left out:
+priors of one recording that are hardly different have differed by .006."""
 GOOD_MAPS = 3.0
 """Then they are used if depth is so many times as far off there without them."""
 
