@@ -14,7 +14,7 @@ from d2_plugin.priors.geometry import check_depth_range, check_views, view_pair
 from d2_plugin.priors.settings import StereoSettings
 from d2_plugin.priors.stereo.depth_range import depth_bounds
 from d2_plugin.priors.stereo.filtering.filter import GeometricDepth
-from d2_plugin.priors.stereo.geometric_depth import brought, geometric_depth
+from d2_plugin.priors.stereo.geometric_depth import geometric_depth, resampled
 from d2_plugin.recordings.recording import Camera, Recording
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 
@@ -95,20 +95,20 @@ def geometric(depth: np.ndarray) -> GeometricDepth:
 def test_enlarging_a_plane_is_exact_and_an_edge_is_left_out() -> None:
     v, u = np.mgrid[:20, :30]
     inverse = 0.2 + 0.001 * u + 0.002 * v
-    large = brought(geometric((1 / inverse).astype(np.float32)), 60, 40, tolerance=0.05)
+    large = resampled(geometric((1 / inverse).astype(np.float32)), 60, 40, tolerance=0.05)
     v, u = (np.mgrid[:40, :60] + 0.5) / 2 - 0.5
     inside = np.s_[2:-2, 2:-2]  # the outermost pixels extrapolate, and take the value at the rim
     np.testing.assert_allclose(large.depth[inside], (1 / (0.2 + 0.001 * u + 0.002 * v))[inside], rtol=1e-5)
     step = np.where(np.arange(30) < 15, 2.0, 4.0)[None].repeat(20, 0).astype(np.float32)
-    edge = brought(geometric(step), 60, 40)
+    edge = resampled(geometric(step), 60, 40)
     assert set(np.unique(edge.depth)) == {0, 2, 4}
     assert not edge.depth[:, 29:31].any()
     hole = step.copy()
     hole[10, 5] = 0
-    assert not brought(geometric(hole), 60, 40).depth[20:22, 10:12].any()
+    assert not resampled(geometric(hole), 60, 40).depth[20:22, 10:12].any()
     np.testing.assert_array_equal(np.isfinite(edge.sigma), edge.depth > 0)
     np.testing.assert_array_equal(edge.sigma[edge.depth > 0], np.float32(0.01))
-    back = brought(large, 30, 20, tolerance=0.05)  # of pixels that were made
+    back = resampled(large, 30, 20, tolerance=0.05)  # of pixels that were made
     np.testing.assert_allclose(back.sigma[back.depth > 0], 0.02, rtol=1e-6)
 
 

@@ -60,7 +60,7 @@ def geometric_depth(
         tolerance = RELATIVE_DEPTH * max(scale, 1)
         filtered = _matched(small, small_cameras, depth_range, settings, memory, tolerance)
         by_scale.append(
-            [brought(one, camera.width, camera.height, tolerance) for one, camera in zip(filtered, cameras)]
+            [resampled(one, camera.width, camera.height, tolerance) for one, camera in zip(filtered, cameras)]
         )
     return [_filled(results) for results in zip(*by_scale)]
 
@@ -111,7 +111,7 @@ def _resized(gray: np.ndarray, camera: Camera, max_pixels: int, scale: float) ->
     return resized, scaled_camera(camera, width, height)
 
 
-def brought(result: GeometricDepth, width: int, height: int, tolerance: float = RELATIVE_DEPTH) -> GeometricDepth:
+def resampled(result: GeometricDepth, width: int, height: int, tolerance: float = RELATIVE_DEPTH) -> GeometricDepth:
     """The maps at another size: inverse depth, which is linear over a plane, is interpolated between four neighbours.
 
     Where they differ by more than twice `tolerance`, or one is missing, nothing is known: an interpolated value would
