@@ -177,9 +177,19 @@ class TestOtherInstants:
         motion, store = Motion(MotionConfig(again=0.5)), Taken()
         store.underway = lambda camera, frame, quarter: (frame + 1, Halfway().underway(camera, 0, quarter)[1])
         context = context_of(make_adapter(make_model()), store, known[:1], known)
-        looks = [view.time for view, _, _ in motion._looks(context, FIRST)]
+        looks = [look.view.time for look in motion._looks(context, FIRST)]
         assert len(looks) == 5
         assert looks[0] == 0.25, "halfway"
+
+
+def test_late_in_a_run_images_on_the_way_count_a_quarter_and_those_that_were_taken_in_full() -> None:
+    adapter = make_adapter(make_model())
+    assert MotionConfig.for_iterations(2000).late == 1400
+    early, late = (loss_of(adapter, Taken(), step=step, late=6) for step in (2, 6))  # both look halfway
+    assert torch.allclose(late, early / 4)
+    context = context_of(adapter, Taken(), [FIRST], [FIRST, SECOND], 6)
+    weights = [look.weight for look in Motion(MotionConfig(late=6, again=1.0))._looks(context, FIRST)]
+    assert weights == [0.25, 1.0, 1.0]
 
 
 class TestInsertionHalfway:
