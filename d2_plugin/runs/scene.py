@@ -94,14 +94,14 @@ class Scene:
         """A new trainer of the run's backbone on the training cameras.
 
         Args:
-            sparse: the triangulated points, by which the extent of the scene is known.
+            sparse: the triangulated points, by which the extent of the scene is known where they are enough.
             start: what Gaussians start from, filled up with random points.
             attach: makes the hooks of a model; None for none.
             appearance: whether cameras learn a change of colour where the plan says so.
         """
         backbone: Any = registry.load(registry.BACKBONES, settings.backbone)
         recording, cameras = self.recording, self.train_cameras
-        extent = scene_extent(recording, cameras, sparse.positions)
+        extent = scene_extent(recording, cameras, sparse.positions, start.positions)
         # What the scene needs, that alone: a backbone of somebody else's may not know the name.
         needed = {"appearance": True} if appearance and self.plan.uses("appearance") else {}
         model = backbone.create(

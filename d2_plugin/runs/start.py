@@ -22,6 +22,7 @@ from d2_plugin.priors.stereo.depth_range import FEWEST
 from d2_plugin.protocol import DepthPrior, Label, View
 from d2_plugin.reading import parsing
 from d2_plugin.recordings import Recording
+from d2_plugin.recordings.cameras.camera import focus_of
 from d2_plugin.recordings.recording import Camera
 from d2_plugin.recordings.selection import spread
 
@@ -166,25 +167,27 @@ class Extent:
     """What learning rates and size limits of Gaussians are relative to."""
 
 
-def scene_extent(recording: Recording, cameras: Sequence[str], points: np.ndarray) -> Extent:
-    """From triangulated points [P, 3] where there are at least ten, else from declared bounds, else from the rig.
+def scene_extent(recording: Recording, cameras: Sequence[str], *points: np.ndarray) -> Extent:
+    """From the first of several sets of world points [P, 3] that the cameras see `FEWEST` times, else that they see ten
+    times, else from declared bounds, else from where the cameras look.
 
     The radius is half the median depth: the spread of the cameras, which dense-rig code uses, says little about the
     scene when there are two of them.
     """
     poses = [recording.cameras[name].T_camera_world for name in cameras]
-    depths = np.concatenate([points @ T[2, :3] + T[2, 3] for T in poses])
-    depths = depths[depths > 0]
-    if len(depths) >= 10:
-        low, middle, high = np.percentile(depths, [1, 50, 99])
-        return Extent(0.75 * float(low), 1.25 * float(high), 0.5 * float(middle))
+    seen = [np.concatenate([positions @ T[2, :3] + T[2, 3] for T in poses]) for positions in points]
+    for least, depths in itertools.product((FEWEST, 10), seen):
+        if np.count_nonzero(depths > 0) >= least:
+            low, middle, high = np.percentile(depths[depths > 0], [1, 50, 99])
+            return Extent(0.75 * float(low), 1.25 * float(high), 0.5 * float(middle))
     bounds = [near_far for name in cameras if (near_far := recording.cameras[name].near_far) is not None]
     if bounds:
         near, far = min(b[0] for b in bounds), max(b[1] for b in bounds)
         return Extent(0.8 * near, 1.2 * far, 0.5 * float(np.sqrt(near * far)))
     centres = np.stack([recording.cameras[name].centre for name in cameras])
-    spread = float(np.linalg.norm(centres - centres.mean(0), axis=1).max()) or 1.0
-    return Extent(0.2 * spread, 20 * spread, 2 * spread)
+    focus = focus_of(centres, np.stack([T[2, :3] for T in poses]))
+    away = float(np.median(np.linalg.norm(centres - focus, axis=1)))
+    return Extent(0.25 * away, 8 * away, 0.5 * away)
 
 
 def initial_points(

@@ -24,6 +24,7 @@ from d2_plugin.recordings.cameras.camera import (
     LARGEST_SIDE,
     OPENGL_TO_OPENCV,
     checked_camera,
+    focus_of,
     look_at,
     pinhole,
     rigid,
@@ -126,20 +127,6 @@ class Rig(NamedTuple):
             "elevation": np.clip([elevation.min(), elevation.max()] + margin, -1.5, 1.5).tolist(),
             "distance": [NEAREST * float(distance.min()), FARTHEST * float(distance.max())],
         }
-
-
-def focus_of(centres: np.ndarray, forwards: np.ndarray, depth: float | None = None) -> np.ndarray:
-    """The point nearest to all optical axes; `depth` in front of the mean camera where they do not meet before them."""
-    across = np.eye(3) - forwards[:, :, None] * forwards[:, None, :]  # projections across each axis
-    normal, right = across.sum(axis=0), (across @ centres[:, :, None]).sum(axis=0)[:, 0]
-    eigenvalues = np.linalg.eigvalsh(normal)
-    if eigenvalues[0] > 1e-4 * len(centres):
-        point = np.linalg.solve(normal, right)
-        if ((point - centres) * forwards).sum(axis=1).min() > 0:
-            return point
-    spread = np.linalg.norm(centres - centres.mean(axis=0), axis=1).max()
-    far = depth if depth is not None else max(4 * spread, 1.0)
-    return centres.mean(axis=0) + far * unit(forwards.mean(axis=0))
 
 
 def _arc(flat: np.ndarray, up: np.ndarray) -> tuple[float, float]:

@@ -10,6 +10,7 @@ from prior_cases import world_points
 
 from d2_plugin.priors.geometry import projected
 from d2_plugin.protocol import DepthPrior, Label
+from d2_plugin.recordings.cameras.camera import look_at
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.runs.start import FROM_STEREO, TimedPoints, TrainingFrames, initial_points, scene_extent, with_stereo
 
@@ -44,6 +45,27 @@ def test_extent_comes_from_points_where_there_are_enough(recording) -> None:
     assert extent.near < np.percentile(depth, 5)
     assert extent.far > np.percentile(depth, 95)
     assert 0.3 < extent.radius / (0.5 * np.median(depth)) < 3
+
+
+def test_a_handful_of_triangulated_points_leaves_the_extent_to_stereo(recording) -> None:
+    surface = surface_points(recording, 500)
+    handful = surface_points(recording, 6)
+    handful[:] = recording.cameras["train0"].world(np.array([[48.0, 27.0]]), np.array([0.5]))  # all on one near thing
+    assert scene_extent(recording, CAMERAS, handful, surface) == scene_extent(recording, CAMERAS, surface)
+    alone = scene_extent(recording, CAMERAS, handful, np.zeros((0, 3)))
+    assert alone == scene_extent(recording, CAMERAS, handful), "better than nothing"
+
+
+def test_without_points_the_extent_is_where_the_cameras_look(recording) -> None:
+    """Cameras all around a person: twice the spread of such a rig is far more than what it sees."""
+    around = {}
+    for place, angle in enumerate(np.radians([0, 100, 230])):
+        centre = np.array([3.5 * np.cos(angle), 3.5 * np.sin(angle), 0.0])
+        camera = recording.cameras[CAMERAS[0]]
+        around[str(place)] = replace(camera, T_camera_world=look_at(centre, np.zeros(3), np.eye(3)[2]), near_far=None)
+    extent = scene_extent(replace(recording, cameras=around), tuple(around), np.zeros((0, 3)))
+    assert extent.radius == pytest.approx(3.5 / 2)
+    assert extent.near < 3.5 < extent.far
 
 
 def test_extent_falls_back_to_declared_bounds_and_then_to_the_rig(recording) -> None:

@@ -9,9 +9,9 @@ import pytest
 from refusals import refuses
 
 from d2_plugin.recordings import Camera
-from d2_plugin.recordings.cameras.camera import look_at
+from d2_plugin.recordings.cameras.camera import focus_of, look_at
 from d2_plugin.recordings.synthetic.room import synthetic_recording
-from d2_plugin.viewing.camera_paths import MARGIN, Rig, camera_path_text, focus_of, for_size, orbit, read_camera_path
+from d2_plugin.viewing.camera_paths import MARGIN, Rig, camera_path_text, for_size, orbit, read_camera_path
 
 ARC = list(synthetic_recording(cameras=4, held_out=0, frames=1, width=96, height=54).cameras.values())
 

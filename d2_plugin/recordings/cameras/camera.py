@@ -94,6 +94,26 @@ def rig_width(cameras: Iterable[Camera | CalibratedCamera]) -> float:
     return float(np.linalg.norm(centres[:, None] - centres, axis=-1).max())
 
 
+def focus_of(centres: np.ndarray, forwards: np.ndarray, depth: float | None = None) -> np.ndarray:
+    """The point [3] nearest to all optical axes; `depth` before the mean camera where they do not meet in front of all.
+
+    Args:
+        centres: of the cameras [N, 3].
+        forwards: unit vectors [N, 3] along their axes.
+        depth: world units; four times the spread of the centres where none is given.
+    """
+    across = np.eye(3) - forwards[:, :, None] * forwards[:, None, :]  # projections across each axis
+    normal, right = across.sum(axis=0), (across @ centres[:, :, None]).sum(axis=0)[:, 0]
+    eigenvalues = np.linalg.eigvalsh(normal)
+    if eigenvalues[0] > 1e-4 * len(centres):
+        point = np.linalg.solve(normal, right)
+        if ((point - centres) * forwards).sum(axis=1).min() > 0:
+            return point
+    spread = np.linalg.norm(centres - centres.mean(axis=0), axis=1).max()
+    far = depth if depth is not None else max(4 * spread, 1.0)
+    return centres.mean(axis=0) + far * unit(forwards.mean(axis=0))
+
+
 def pinhole(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
     """K [3, 3] float64 in pixels."""
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
