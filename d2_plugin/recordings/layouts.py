@@ -9,13 +9,14 @@ from typing import NamedTuple, Optional
 
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.reading import reaching
+from d2_plugin.recordings.cameras.formats.easymocap import INTRINSICS
 from d2_plugin.recordings.readers.colmap import is_colmap, open_colmap
-from d2_plugin.recordings.readers.enerf import is_enerf, open_enerf
+from d2_plugin.recordings.readers.enerf import open_enerf
 from d2_plugin.recordings.readers.folder import CALIBRATION, is_folder, open_folder
-from d2_plugin.recordings.readers.n3dv import is_n3dv, open_n3dv
-from d2_plugin.recordings.readers.technicolor import is_technicolor, open_technicolor
-from d2_plugin.recordings.readers.transforms_json import is_transforms, open_transforms
-from d2_plugin.recordings.readers.videos import is_videos, open_videos
+from d2_plugin.recordings.readers.n3dv import POSES, open_n3dv
+from d2_plugin.recordings.readers.technicolor import PARAMETERS, open_technicolor
+from d2_plugin.recordings.readers.transforms_json import FILES, open_transforms
+from d2_plugin.recordings.readers.videos import TABLE, open_videos
 from d2_plugin.recordings.recording import Recording
 from d2_plugin.recordings.selection import downscale as downscaled
 from d2_plugin.recordings.selection import select_frames
@@ -32,13 +33,17 @@ class Layout(NamedTuple):
     open: Reader
 
 
+def _holds(*names: str) -> Callable[[Path], bool]:
+    return lambda folder: any((folder / name).is_file() for name in names)
+
+
 LAYOUTS: dict[str, Layout] = {
     "folder": Layout(is_folder, open_folder),
-    "videos": Layout(is_videos, open_videos),
-    "n3dv": Layout(is_n3dv, open_n3dv),
-    "technicolor": Layout(is_technicolor, open_technicolor),
-    "enerf": Layout(is_enerf, open_enerf),
-    "transforms": Layout(is_transforms, open_transforms),
+    "videos": Layout(_holds(TABLE), open_videos),
+    "n3dv": Layout(_holds(POSES), open_n3dv),
+    "technicolor": Layout(_holds(PARAMETERS), open_technicolor),
+    "enerf": Layout(_holds(INTRINSICS), open_enerf),
+    "transforms": Layout(_holds(*FILES), open_transforms),
     "colmap": Layout(is_colmap, open_colmap),
 }
 """By name, in the order in which a folder is tried. A new layout is one module in readers/ and one row here."""

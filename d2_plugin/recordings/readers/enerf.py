@@ -17,11 +17,6 @@ ENERF_FPS = 60.0  # frame rate at which EasyVolcap plays the data set; the files
 NOT_USED = ("bkgd", "vhull", "background.ply")  # what recordings of this layout may also hold
 
 
-def is_enerf(path: Path) -> bool:
-    """Whether `path` looks like the layout of EasyMocap and EasyVolcap."""
-    return (path / INTRINSICS).is_file()
-
-
 def open_enerf(path: Path, cameras: tuple[str, ...] | None = None, intersect: bool = False) -> Recording:
     """Read the layout of EasyMocap and EasyVolcap; of the images only headers are opened.
 

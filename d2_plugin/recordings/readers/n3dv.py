@@ -42,11 +42,6 @@ RIG_SIZE = 21
 _NUMBERED_NAME = re.compile(r"cam(\d+)$")
 
 
-def is_n3dv(path: Path) -> bool:
-    """Whether `path` looks like the N3DV layout."""
-    return (path / POSES).is_file()
-
-
 def open_n3dv(path: Path, cameras: tuple[str, ...] | None = None, intersect: bool = False) -> Recording:
     """Read the N3DV layout; frames are decoded when asked for, time stamps and headers alone are read here.
 

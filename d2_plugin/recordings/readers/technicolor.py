@@ -47,11 +47,6 @@ NEAR_FAR = {
 _NAME = re.compile(r"(?P<scene>(?!\.)[^_]*)_.*?(?P<frame>\d+)_(?P<camera>\d+)$")
 
 
-def is_technicolor(path: Path) -> bool:
-    """Whether `path` looks like the Technicolor layout."""
-    return (path / PARAMETERS).is_file()
-
-
 def open_technicolor(path: Path, cameras: tuple[str, ...] | None = None, intersect: bool = False) -> Recording:
     """Read the Technicolor layout; of the images only headers are opened.
 

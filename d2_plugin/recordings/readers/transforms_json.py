@@ -33,11 +33,6 @@ class _Entry(NamedTuple):
     listed_in: Path
 
 
-def is_transforms(path: Path) -> bool:
-    """Whether `path` holds a transforms.json or one of its parts."""
-    return any((path / name).is_file() for name in FILES)
-
-
 def open_transforms(path: Path, cameras: tuple[str, ...] | None = None, intersect: bool = False) -> Recording:
     """Read transforms.json, or transforms_train.json with its companions; only headers of images are opened.
 

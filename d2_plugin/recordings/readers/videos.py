@@ -20,11 +20,6 @@ TABLE = "videos.json"
 KIND = Kind("description of videos", 1, "import the videos again into another folder")
 
 
-def is_videos(path: Path) -> bool:
-    """Whether `path` holds such a description."""
-    return (path / TABLE).is_file()
-
-
 def open_videos(path: Path, cameras: tuple[str, ...] | None = None, intersect: bool = False) -> Recording:
     """The recording; only the headers of the videos are read. `intersect` changes nothing: nothing can be missing."""
     where = path / TABLE
