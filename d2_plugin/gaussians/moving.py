@@ -21,11 +21,9 @@ from d2_plugin.gaussians.rotation4d import (
     covariances_from_factors,
     rotation_matrices_3d,
     rotation_matrices_4d,
-    temporal_marginal,
     unit_quaternions,
 )
-from d2_plugin.gaussians.slicing import LOG_SCALE_LIMIT, MARGINAL_CUT
-from d2_plugin.protocol import Splats
+from d2_plugin.gaussians.slicing import LOG_SCALE_LIMIT
 
 
 class LinearMotion(NamedTuple):
@@ -66,17 +64,6 @@ class MovingGaussians:
 
     def __len__(self) -> int:
         return len(self.positions)
-
-    def at(self, time: float) -> Splats:
-        """The 3D Gaussians of one instant, without those whose temporal factor is not above `MARGINAL_CUT`."""
-        rows = torch.arange(len(self))
-        if self.motion is None:
-            return Splats(self.positions, self.covariances, self.opacities, rows)
-        offset = time - self.motion.times
-        factor = temporal_marginal(offset, self.motion.sigmas**2)
-        means = self.positions + self.motion.velocities * offset[:, None]
-        kept = factor > MARGINAL_CUT
-        return Splats(means[kept], self.covariances[kept], (self.opacities * factor)[kept], rows[kept])
 
     def select(self, rows: Tensor) -> MovingGaussians:
         """The Gaussians `rows`, an index or a mask, in its order."""

@@ -12,11 +12,29 @@ import torch
 from torch import Tensor
 
 from d2_plugin.gaussians.moving import Harmonics, MovingGaussians
-from d2_plugin.gaussians.rotation4d import covariances_from_factors, normalized_quaternions, rotation_matrices_3d
+from d2_plugin.gaussians.rotation4d import (
+    covariances_from_factors,
+    normalized_quaternions,
+    rotation_matrices_3d,
+    temporal_marginal,
+)
 from d2_plugin.gaussians.slicing import MARGINAL_CUT
+from d2_plugin.protocol import Splats
 from d2_plugin.viewing.checkpoints import read_ply
 from d2_plugin.viewing.checkpoints.files import columns
 from d2_plugin.viewing.export.keys import Keys, Offset, State
+
+
+def splats_at(moving: MovingGaussians, time: float) -> Splats:
+    """The 3D Gaussians of one instant, without those whose temporal factor is not above `MARGINAL_CUT`."""
+    rows = torch.arange(len(moving))
+    if moving.motion is None:
+        return Splats(moving.positions, moving.covariances, moving.opacities, rows)
+    offset = time - moving.motion.times
+    factor = temporal_marginal(offset, moving.motion.sigmas**2)
+    means = moving.positions + moving.motion.velocities * offset[:, None]
+    kept = factor > MARGINAL_CUT
+    return Splats(means[kept], moving.covariances[kept], (moving.opacities * factor)[kept], rows[kept])
 
 
 class ReadPage:

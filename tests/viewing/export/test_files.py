@@ -10,7 +10,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from oracles.export_files import ReadPage, covariances_from, covariances_of, read_still_ply
+from oracles.export_files import ReadPage, covariances_from, covariances_of, read_still_ply, splats_at
 from refusals import refuses
 from viewing.export.scenes import DURATION, make_scene, sharp_model, with_harmonics
 
@@ -35,7 +35,7 @@ class TestStraightLines:
         moving = model.moving()
         raw = {name: value.detach().double() for name, value in model._raw().items()}
         for time in TIMES:
-            true, moved = slice_gaussians(raw, time), moving.at(time)
+            true, moved = slice_gaussians(raw, time), splats_at(moving, time)
             torch.testing.assert_close(moved.rows, true.rows)
             for name in ("means", "covariances", "opacities"):
                 torch.testing.assert_close(getattr(moved, name), getattr(true, name), rtol=1e-9, atol=1e-12)
@@ -162,7 +162,7 @@ class TestOthersReadIt:
         shown = scene.moving.select(seen_rows(scene.moving, DURATION))
         assert len(found) == len(shown)
         for time in TIMES:  # in another order: by their places
-            here, there = shown.at(time), found.at(time)
+            here, there = splats_at(shown, time), splats_at(found, time)
             apart = torch.cdist(here.means, there.means)
             seen = (here.opacities >= 1 / 255) & (scene.pixels_per_unit(here.means) > 0)
             nearest = apart.argmin(1)
