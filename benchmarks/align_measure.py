@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from d2_plugin.errors import D2Error
-from d2_plugin.priors.monocular.affine import AffineFit, charbonnier, fit_affine
+from d2_plugin.priors.monocular.affine import AffineFit, fit_affine
 from d2_plugin.priors.monocular.align import align
 from d2_plugin.priors.settings import AlignSettings
 from d2_plugin.recordings.recording import MonoKind
@@ -71,6 +71,11 @@ class AlignProblem:
         """F of a line: the Charbonnier penalties of the relative or absolute residuals, as `align` sums them."""
         weights, epsilon = weights_and_epsilon(self.target, residual)
         return float(charbonnier(weights * (line[0] * self.mono + line[1] - self.target), epsilon).sum())
+
+
+def charbonnier(residual: np.ndarray, epsilon: float) -> np.ndarray:
+    """rho(r) = sqrt(r^2 + eps^2) - eps, in a form that neither cancels at small residuals nor overflows."""
+    return residual * (residual / (np.hypot(residual, epsilon) + epsilon))
 
 
 def align_problem(kind: MonoKind, anchors: int, outliers: float, seed: int = 0) -> AlignProblem:

@@ -109,11 +109,6 @@ def fit_affine(
     )
 
 
-def charbonnier(residual: np.ndarray, epsilon: float) -> np.ndarray:
-    """rho(r) = sqrt(r^2 + eps^2) - eps, in a form that neither cancels at small residuals nor overflows."""
-    return residual * (residual / (np.hypot(residual, epsilon) + epsilon))
-
-
 def _usable(x: np.ndarray, y: np.ndarray, weights: np.ndarray | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     x, y = np.asarray(x, np.float64).ravel(), np.asarray(y, np.float64).ravel()
     weights = np.ones_like(x) if weights is None else np.asarray(weights, np.float64).ravel()
