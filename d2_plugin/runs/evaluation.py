@@ -145,7 +145,6 @@ def evaluate(
     for name in BETWEEN if apart else ():
         means[f"{name}_between"] = _mean(row[name] for row in apart)
         variants[f"{name}_between"] = f"at instants between trained ones: {metrics.VARIANTS[name]}"
-    variants |= {name: net.variant for name, net in networks.items() if net is not None}
     groups = {"per_frame": _grouped(rows, "frame"), "per_camera": _grouped(trained, "camera")}
     return {"test": means, "per_view": rows, **groups, "variants": variants}
 

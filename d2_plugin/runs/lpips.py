@@ -50,11 +50,6 @@ class Lpips:
             self.weights = [weights[f"lin{i}.model.1.weight"].flatten() for i in range(len(_TAPS[net]))]
         self.layers.eval().requires_grad_(False)
 
-    @property
-    def variant(self) -> str:
-        """The definition behind the number, for metrics.json."""
-        return f"version 0.1, {self.net}, images in 0..1 unmapped (lpipsPyTorch, as 3DGS codebases)"
-
     @torch.no_grad()
     def __call__(self, image: Tensor, truth: Tensor) -> float:
         """Distance of two images [H, W, 3] in 0..1; 0 for equal ones, larger is worse."""

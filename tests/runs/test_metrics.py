@@ -182,7 +182,6 @@ def test_the_distance_is_the_published_formula_on_images_in_0_to_1(tmp_path: Pat
     weights, before = write_weights(tmp_path, net), torch.get_rng_state()
     distance = find_lpips(net, tmp_path)
     assert torch.equal(torch.get_rng_state(), before)
-    assert net in distance.variant
     a, b = torch.rand(2, 66, 66, 3, generator=torch.Generator().manual_seed(2))
     shift, scale = torch.tensor([-0.030, -0.088, -0.188]), torch.tensor([0.458, 0.448, 0.450])
     x = torch.stack([((image - shift) / scale).permute(2, 0, 1) for image in (a, b)])
