@@ -10,7 +10,6 @@ from typing import Annotated
 
 from d2_plugin.commands.arguments.form import Form, Given
 from d2_plugin.commands.arguments.recording import ConfigFile, recording_form, run_settings
-from d2_plugin.commands.train import TABLES
 from d2_plugin.settings import AtATime, Range, Seed
 
 
@@ -34,7 +33,7 @@ class AblationOptions(ConfigFile):
 
 def form(words: list[str]) -> Form:
     """What `d2 ablate` takes."""
-    return recording_form("d2 ablate", __doc__, run, ("test_cameras", "hold_out_instants"), AblationOptions, TABLES)
+    return recording_form("d2 ablate", __doc__, run, ("test_cameras", "hold_out_instants"), AblationOptions)
 
 
 def run(given: Given) -> str:

@@ -21,8 +21,6 @@ OF_THE_RUN = (
     *("test_cameras", "backbone", "iterations", "hooks", "priors", "accept_empty_prior"),
     *("hold_out_instants", "background_weight", "seed", "device"),
 )
-HOOKS = ("densify", "prune", "depth_loss", "motion", "parallax")
-TABLES = (*HOOKS, "d2", "priors", "backbone", "training", "plan", "import")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,7 +38,7 @@ class TrainOptions(ConfigFile):
 
 def form(words: list[str]) -> Form:
     """What `d2 train` takes."""
-    return recording_form("d2 train", __doc__, run, OF_THE_RUN, TrainOptions, TABLES)
+    return recording_form("d2 train", __doc__, run, OF_THE_RUN, TrainOptions)
 
 
 def run(given: Given) -> str:

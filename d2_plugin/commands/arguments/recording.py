@@ -54,7 +54,8 @@ def recording_form(
     """The form of a command on a recording.
 
     It takes the settings of a run in `RECORDING` and `more`, those of its own in `options`, which replace settings of a
-    run with the same name, and `tables` of settings by dotted flags, that of the import beside --calibration alone.
+    run with the same name, and `tables` of settings (all if none are named) by dotted flags, that of the
+    import beside --calibration alone.
     """
     from d2_plugin.runs.settings import RunSettings
 
@@ -65,7 +66,7 @@ def recording_form(
     def groups(typed: Mapping[str, str]) -> dict[str, Group]:
         named = typed.get("backbone") or typed.get("backbones") or "yang4d"
         known = all_tables(named.partition(",")[0])
-        return {name: known[name] for name in tables if name != "import" or "calibration" in typed}
+        return {name: known[name] for name in tables or known if name != "import" or "calibration" in typed}
 
     return Form(command, about or "", (*taken, *own), run, groups, {"hooks": hook_names})
 
