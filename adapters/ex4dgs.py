@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from d2_plugin.gaussians.slicing import rows_to_draw
-from d2_plugin.protocol import Points, Splats, View
+from d2_plugin.protocol import Points, Splats, View, covariance_matrices
 
 from .inria import InriaAdapter
 from .keys import KeyOf, PriorKey, key_from_image_name, key_of_technicolor
@@ -104,10 +104,8 @@ class Ex4DGSAdapter(InriaAdapter):
         fx, fy = view.K[0, 0], view.K[1, 1]
         zero = torch.zeros_like(z)
         J = torch.stack([fx / z, zero, -fx * x / z**2, zero, fy / z, -fy * y / z**2], -1).view(-1, 2, 3)
-        xx, xy, xz, yy, yz, zz = covariances.unbind(-1)
-        full = torch.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], -1).view(-1, 3, 3)
         A = J @ view.T_camera_world[:3, :3]
-        C = A @ full @ A.transpose(1, 2)
+        C = A @ covariance_matrices(covariances) @ A.transpose(1, 2)
         a, b, c = C[:, 0, 0], C[:, 0, 1], C[:, 1, 1]
         blur = self.settings.blur
         sharp = a * c - b * b

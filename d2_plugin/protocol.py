@@ -275,6 +275,12 @@ class Backbone(Protocol):
         """Register a listener for every structural change, the backbone's own ones included."""
 
 
+def covariance_matrices(covariances: Tensor) -> Tensor:
+    """[M, 3, 3] from [M, 6]."""
+    xx, xy, xz, yy, yz, zz = covariances.unbind(-1)
+    return torch.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], -1).view(-1, 3, 3)
+
+
 def call_optional(backbone: object, name: str, *arguments: Any, default: Any = None) -> Any:
     """What an optional member of a backbone returns (see `Backbone`), or `default` where the backbone has none."""
     method = getattr(backbone, name, None)

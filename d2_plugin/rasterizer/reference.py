@@ -21,7 +21,7 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from d2_plugin.errors import D2Error
-from d2_plugin.protocol import DepthPrior, RasterSettings, Render, Splats, Survey, View
+from d2_plugin.protocol import DepthPrior, RasterSettings, Render, Splats, Survey, View, covariance_matrices
 
 TILE = 16
 """Side of the squares of pixels that are composited at once; limits memory, changes nothing else."""
@@ -199,9 +199,7 @@ def project(splats: Splats, view: View, settings: RasterSettings, screen_offsets
 
     # Rows of J W: the gradient of the screen coordinate with respect to the world point.
     jacobian = (focal / depths[:, None])[..., None] * (rotation[:2] - slopes_clamped[..., None] * rotation[2])
-    xx, xy, xz, yy, yz, zz = splats.covariances.unbind(-1)
-    covariance = torch.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], -1).reshape(-1, 3, 3)
-    screen = jacobian @ covariance @ jacobian.mT
+    screen = jacobian @ covariance_matrices(splats.covariances) @ jacobian.mT
     floor = max(settings.blur, VARIANCE_FLOOR)
     own_x, own_y = screen[:, 0, 0].clamp(min=0), screen[:, 1, 1].clamp(min=0)
     variance_x, variance_y = own_x + floor, own_y + floor

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from d2_plugin.gaussians.nearest import nearest
-from d2_plugin.protocol import Backbone, Points, Splats, View
-from d2_plugin.testing.example import Check, Example, matrices, some_points, some_rows
+from d2_plugin.protocol import Backbone, Points, Splats, View, covariance_matrices
+from d2_plugin.testing.example import Check, Example, some_points, some_rows
 
 PLACED = 0.5
 """Share of inserted Gaussians that must be where they were asked for: a deformation field cannot always be inverted."""
@@ -116,7 +116,8 @@ def _placed(example: Example, view: View, points: Points, index: Tensor) -> Iter
     distance, _ = nearest(points.positions.to(splats.means), splats.means[new], 1)
     if (distance < 2 * points.scales.mean()).double().mean() < PLACED:
         yield "inserted Gaussians are not where their points are, at the time of their points"
-    wide = matrices(splats.covariances[new].double()).diagonal(dim1=-2, dim2=-1).mean(-1).sqrt().median().item()
+    variances = covariance_matrices(splats.covariances[new].double()).diagonal(dim1=-2, dim2=-1)
+    wide = variances.mean(-1).sqrt().median().item()
     asked = points.scales.median().item()
     if not 0.5 * asked < wide < 2 * asked:
         yield f"inserted Gaussians have a standard deviation of {wide:.4g}, asked for {asked:.4g} in world units"

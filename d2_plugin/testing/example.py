@@ -61,9 +61,3 @@ def some_rows(example: Example) -> Tensor:
     """Every third row."""
     view = example.views[0]
     return torch.arange(len(example.backbone), device=view.K.device) % 3 == 1
-
-
-def matrices(covariances: Tensor) -> Tensor:
-    """[M, 3, 3] from [M, 6]."""
-    xx, xy, xz, yy, yz, zz = covariances.unbind(-1)
-    return torch.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], -1).view(-1, 3, 3)

@@ -7,9 +7,9 @@ from collections.abc import Iterator
 import torch
 
 from d2_plugin.hooks.expected import check_view
-from d2_plugin.protocol import Splats, View
+from d2_plugin.protocol import Splats, View, covariance_matrices
 from d2_plugin.rasterizer import rasterize
-from d2_plugin.testing.example import Check, Example, matrices, some_points, some_rows
+from d2_plugin.testing.example import Check, Example, some_points, some_rows
 
 
 def _views(example: Example) -> Iterator[str]:
@@ -76,7 +76,7 @@ def _shapes(splats: Splats, count: int) -> Iterator[str]:
         return
     if ((splats.opacities < 0) | (splats.opacities > 1)).any():
         yield "opacities of a slice are outside 0..1: activate them, temporal factor included"
-    smallest = torch.linalg.eigvalsh(matrices(splats.covariances.detach().double()))[:, 0]
+    smallest = torch.linalg.eigvalsh(covariance_matrices(splats.covariances.detach().double()))[:, 0]
     if (smallest < -1e-6 * splats.covariances.detach().abs().amax(-1)).any():
         yield "a covariance has a negative eigenvalue: the order is xx xy xz yy yz zz"
 

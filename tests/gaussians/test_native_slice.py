@@ -17,6 +17,7 @@ from d2_plugin.gaussians import native_slice as kernel
 from d2_plugin.gaussians import rotation4d
 from d2_plugin.gaussians.native_slice import TEMPORAL, native_slice
 from d2_plugin.gaussians.slicing import reference_slice
+from d2_plugin.protocol import covariance_matrices
 
 OUTPUTS = ("means", "covariances", "opacities")
 
@@ -260,8 +261,7 @@ def test_a_slice_of_a_long_life_is_positive_definite_as_the_rasterizer_gets_it(t
     rows["log_scales"] = torch.tensor([1e-2, 1e-2, 1e-2]).log().expand(2000, 3)
     rows["log_time_scales"] = torch.full((2000,), math.log(100.0))
     found = take_slice(rows, 0.5)
-    xx, xy, xz, yy, yz, zz = found.covariances.double().T
-    matrices = torch.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], -1).view(-1, 3, 3)
+    matrices = covariance_matrices(found.covariances.double())
     # One eigenvalue is 1e-4, one may be as large as 1e4: beyond that, the six float32 numbers cannot hold it.
     narrow = torch.linalg.eigvalsh(matrices)[:, 2] < 1e2
     assert narrow.double().mean() > 0.9

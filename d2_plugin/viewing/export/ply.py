@@ -9,6 +9,7 @@ from torch import Tensor
 
 from d2_plugin.durable import write
 from d2_plugin.gaussians.moving import MovingGaussians
+from d2_plugin.protocol import covariance_matrices
 from d2_plugin.recordings.cameras.rotations import quaternion_of_rotation
 
 ALPHA_MIN = 1 / 255
@@ -50,9 +51,7 @@ def scales_and_rotations(covariances: Tensor) -> tuple[Tensor, Tensor]:
 
     covariance = R diag(scales^2) R^T with R the rotation of the quaternion.
     """
-    xx, xy, xz, yy, yz, zz = covariances.unbind(-1)
-    matrices = torch.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], dim=-1).reshape(-1, 3, 3)
-    variances, axes = torch.linalg.eigh(matrices)
+    variances, axes = torch.linalg.eigh(covariance_matrices(covariances))
     floor = (FLATTEST * variances[:, 2:]).clamp(min=torch.finfo(variances.dtype).tiny)
     mirrored = torch.linalg.det(axes) < 0
     axes = torch.cat([torch.where(mirrored[:, None, None], -axes[..., :1], axes[..., :1]), axes[..., 1:]], dim=-1)
