@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, Literal
 
@@ -101,8 +100,3 @@ class PriorSettings(Settings):
         changes["stereo"] = replace(changes.get("stereo", StereoSettings()), between_pixels=False)
         changes |= {"uncertainty": False, "hanging_limit": 0.0, "agreement": 0.0, "far": False, "between": False}
         return cls(align=align, **changes)
-
-    @classmethod
-    def from_dict(cls, table: Mapping[str, Any], where: str = "priors") -> PriorSettings:
-        """See `Settings.from_dict`; the tables `stereo` and `align` stand inside."""
-        return super().from_dict(table, where)

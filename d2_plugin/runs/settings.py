@@ -156,7 +156,7 @@ def training_settings(settings: RunSettings, backbone: Any) -> Any:
 def prior_settings(settings: RunSettings) -> PriorSettings:
     """Settings of the prior builder: defaults, the monocular source of the run, the user's table over them."""
     source = {name: getattr(settings, name) for name in ("mono_onnx", "mono_kind", "multiview")}
-    return PriorSettings.from_dict(_over(source, settings.overrides.get("priors", {}), "priors"))
+    return PriorSettings.from_dict(_over(source, settings.overrides.get("priors", {}), "priors"), "priors")
 
 
 def hooks_in_use(settings: RunSettings) -> tuple[str, ...]:

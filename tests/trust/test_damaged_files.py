@@ -167,7 +167,7 @@ CASES = {
         lambda p: export_recording(small_recording(), "transforms", p.parent),
         lambda p: RenamedStore.of_export(None, p.parent),
     ),
-    "onnx": Case("net.onnx", lambda p: mean_network(p, 32, 48), lambda p: MonocularModel(p, "relative")(IMAGE)),
+    "onnx": Case("net.onnx", lambda p: mean_network(p, 32, 48), lambda p: MonocularModel(p, "relative").predict(IMAGE)),
     "store": Case("store/store.json", write_store, read_store, kept=True),
     "record": Case("store/priors/a/00000.json", write_store, read_store, kept=True),
     "prior": Case("store/priors/b/00000.npy", write_store, read_store, kept=True),

@@ -112,12 +112,8 @@ class MonocularModel:
         self.provider = self.session.get_providers()[0]
         logger.info("%s: %s, preprocessing %s", self.path.name, self.provider, self.preprocessing)
 
-    def __call__(self, image: np.ndarray) -> np.ndarray:
-        """The prediction for an RGB uint8 image [H, W, 3], float32 [H, W] at its size."""
-        return upsample(self.predict(image), *image.shape[:2])
-
     def predict(self, image: np.ndarray) -> np.ndarray:
-        """The prediction float32 [h, w] at the size the network returns."""
+        """The prediction for an RGB uint8 image [H, W, 3], float32 [h, w] at the size the network returns."""
         output = next(iter(self.arrays([image]).values()))
         prediction = np.squeeze(output, axis=tuple(axis for axis in range(output.ndim - 2) if output.shape[axis] == 1))
         if prediction.ndim != 2 or min(prediction.shape) < 2:
