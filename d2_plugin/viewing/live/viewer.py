@@ -221,7 +221,6 @@ class Follower:
     def __init__(self, d2: D2Hooks, viewer: Viewer) -> None:
         self.d2, self.viewer = d2, viewer
         self.views: dict[tuple[str, int], View] = {}
-        self.inserted = self.removed = 0
         self._cameras: list[Any] = []
         self._shown = 0
         viewer.marks = lambda: d2.inserted_at
@@ -235,8 +234,7 @@ class Follower:
 
     def _step(self, step: int) -> Report:
         report = self._plain_step(step)
-        self.inserted, self.removed = self.inserted + report.inserted, self.removed + report.removed
-        self.viewer.set_score(f"D2: {self.inserted} inserted, {self.removed} removed")
+        self.viewer.set_score(f"D2: {self.d2.log.inserted} inserted, {self.d2.log.removed} removed")
         self._note_views()
         self.viewer.after_step(step)
         return report
