@@ -47,7 +47,7 @@ def read_array(path: Path | str, remedy: str = RESTORE, *, key: str | None = Non
             return found
 
 
-def array_names(path: Path | str, remedy: str = RESTORE) -> set[str]:
+def array_names(path: Path | str, remedy: str) -> set[str]:
     """The names of the arrays in a .npz file."""
     with opened(path, remedy) as file, parsing(shown_path(path), remedy), zipfile.ZipFile(file) as archive:
         return {member.removesuffix(".npy") for member in archive.namelist() if member.endswith(".npy")}

@@ -57,7 +57,7 @@ def run(settings: RecordingExport) -> str:
     return f"{what} in {settings.output} ({settings.format})"
 
 
-def start_cloud(recording: Recording, cameras: Sequence[str], minimum: int = MIN_POINTS, seed: int = 0) -> PointCloud:
+def start_cloud(recording: Recording, cameras: Sequence[str], minimum: int, seed: int) -> PointCloud:
     """Points triangulated from the training cameras, filled up to `minimum` with random ones that the cameras see.
 
     The same start as `d2 train` has, so that another repository can be compared with the bundled backbones.

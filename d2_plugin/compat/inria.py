@@ -151,7 +151,7 @@ def harmonics(means: Tensor, camera_centre: Tensor, degree: int) -> Tensor:
 
 
 @torch.no_grad()
-def screen_radii(splats: Splats, view: View, constants: RasterSettings = SETTINGS) -> Tensor:
+def screen_radii(splats: Splats, view: View, constants: RasterSettings) -> Tensor:
     """Inria's radii [M] int32: three standard deviations along the longer axis, 0 where no tile is touched."""
     forward = view.T_camera_world[2].to(splats.means)
     depths = splats.means @ forward[:3] + forward[3]

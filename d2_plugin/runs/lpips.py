@@ -69,7 +69,7 @@ class Lpips:
                 yield values[0] / (values[0].square().sum(0).sqrt() + 1e-10)
 
 
-def find_lpips(net: str = "alex", folder: Path | None = None) -> Lpips | None:
+def find_lpips(net: str, folder: Path | None = None) -> Lpips | None:
     """LPIPS from weight files in `folder` or the usual places, or None (logged once) where there are none."""
     refuse_unknown("LPIPS network", [net], _FILES)
     package = importlib.util.find_spec("lpips")

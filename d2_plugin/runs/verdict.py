@@ -84,7 +84,7 @@ class Margin:
         return f"{self.value:+.{digits}f}{error}" + (f" {unit}" if unit else "")
 
 
-def margin(ours: Sequence[float], theirs: Sequence[float], larger_is_better: bool = True) -> Margin:
+def margin(ours: Sequence[float], theirs: Sequence[float], larger_is_better: bool) -> Margin:
     """By how much `ours` are better than `theirs`, which are runs of their own: their variances add up.
 
     The standard error is sqrt(s1^2 / n1 + s2^2 / n2) with the sample variances s^2.

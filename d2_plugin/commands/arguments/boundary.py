@@ -24,7 +24,7 @@ OUT_OF_MEMORY = ("can't allocate memory", "not enough memory", "insufficient mem
 """What torch, OpenCV and onnxruntime say, in lower case, where Python would raise MemoryError."""
 
 
-def guarded(answer: Callable[[], str | None], debug: bool = False) -> int:
+def guarded(answer: Callable[[], str | None], debug: bool) -> int:
     """Print what `answer` returns and give 0, or print the sentence of its exception and give another exit code."""
     interrupted: list[int] = []
     _open_closed_streams()

@@ -137,7 +137,7 @@ def monocular_uncertainty(
 
 
 def measured_skill(
-    aligned: np.ndarray, anchors: np.ndarray, settings: AlignSettings, confidence: np.ndarray | None = None
+    aligned: np.ndarray, anchors: np.ndarray, settings: AlignSettings, confidence: np.ndarray | None
 ) -> Skill:
     """Errors at anchors [H, W] that were left out of the correction of `aligned` [H, W]."""
     holes, both = left_out_regions(anchors.shape), (anchors > 0) & (aligned > 0)

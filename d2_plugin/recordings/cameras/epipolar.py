@@ -12,8 +12,6 @@ from d2_plugin.recordings.cameras.rotations import rotation_of_vector
 from d2_plugin.recordings.images import checked_image, opencv
 from d2_plugin.recordings.recording import Camera
 
-OPENCVS_CONTRAST = 0.04  # of a SIFT feature, at least
-
 SCALES = (16.0, 8.0, 4.0, 2.0, 1.0, 1.0, 0.5, 0.5)  # pixels beyond which a match hardly counts, round by round
 LARGEST_TURN = 0.05  # radians of one step
 
@@ -25,7 +23,7 @@ def sift_features(
     image: np.ndarray,
     most: int,
     purpose: str,
-    contrast: float = OPENCVS_CONTRAST,
+    contrast: float,
     mask: np.ndarray | None = None,
     tilted: bool = False,
 ) -> Sift:
@@ -35,6 +33,7 @@ def sift_features(
         image: RGB uint8 [H, W, 3].
         most: features, those of the highest contrast.
         purpose: what needs OpenCV, in the sentence that says where it is missing.
+        contrast: of a feature, at least; .04 in OpenCV.
         mask: bool [H, W], where features may lie.
         tilted: in the image as nine cameras would see it from aside (Morel and Yu 2009: ASIFT), `most` in each.
     """

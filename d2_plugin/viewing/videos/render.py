@@ -100,7 +100,7 @@ def _panels(
     return [p._replace(caption=c) if is_own else p for p, c, is_own in zip(panels, captions, own, strict=True)]
 
 
-def arranged(rows: Sequence[Sequence[Panel]], captions: bool = True) -> np.ndarray:
+def arranged(rows: Sequence[Sequence[Panel]], captions: bool) -> np.ndarray:
     """One image of all panels: one row for each run, or a single row where each has one panel.
 
     A single render stands alone, without a caption: the video then has exactly its size.

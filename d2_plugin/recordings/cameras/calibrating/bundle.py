@@ -126,7 +126,7 @@ def fitting(bundle: Bundle, features: Mapping[str, Features], pixels: float) -> 
     return Bundle(bundle.cameras, bundle.points[kept], Tracks(bundle.tracks.names, seen[kept]))
 
 
-def adjust(bundle: Bundle, features: Mapping[str, Features], scale: float, focal: str | None = None) -> Bundle:
+def adjust(bundle: Bundle, features: Mapping[str, Features], scale: float, focal: str | None) -> Bundle:
     """Poses and points that make the reprojection errors least, with the gauge held by two cameras.
 
     The loss is Cauchy's with `scale` pixels: what misses by much more hardly counts. `focal` frees focal lengths
