@@ -101,7 +101,11 @@ def cluster_client(scheduler: str | None, workers: int, purpose: str = "building
     distributed = imported("distributed", "dask.distributed", "cluster", purpose)
     if scheduler is not None:
         try:
-            distributed.comm.get_address_host_port(scheduler)  # a client without an address ends its process slowly
+            # A client that never connected ends its process slowly.
+            distributed.comm.get_address_host_port(scheduler)
+            certificates = distributed.Security().get_connection_args("client")["ssl_context"]
+            if scheduler.startswith("tls://") and certificates is None:
+                raise ValueError("TLS needs distributed.comm.tls in dask's configuration")
             client = distributed.Client(scheduler, timeout="10s", set_as_default=False)
         except (OSError, TypeError, ValueError) as error:
             raise D2Error(

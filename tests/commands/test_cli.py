@@ -116,7 +116,9 @@ def test_a_part_that_cannot_be_built_is_refused(recording: Path, tmp_path, refus
 
 
 @pytest.mark.parametrize("command", [("priors", "nowhere", "--train-cameras", "a"), ("bench", "training", "nowhere@a")])
-@pytest.mark.parametrize(("at", "why"), [("there", "missing port"), ("tcp://127.0.0.1:1", "Timed out")])
+@pytest.mark.parametrize(
+    ("at", "why"), [("there", "missing port"), ("tls://127.0.0.1:1", "TLS"), ("tcp://127.0.0.1:1", "Timed out")]
+)
 def test_a_cluster_that_is_not_there_is_refused_before_anything_is_read(refused, monkeypatch, command, at, why) -> None:
     distributed = pytest.importorskip("distributed", reason="dask.distributed is in the `cluster` extra")
     connect = Mock(side_effect=lambda at, **more: client(at, **(more | {"timeout": "0.2s"})))
