@@ -96,7 +96,7 @@ def test_the_command_trains_shares_priors_and_repeats_nothing(saved_room, tmp_pa
     pytest.importorskip("pycolmap", reason="pycolmap is in the `stereo` extra")
     room = shutil.copytree(saved_room(cameras=2, held_out=1, frames=2, width=96, height=54), tmp_path / "room")
     command = ["ablate", str(room), "--train-cameras", "train0,train1", "--rows", "main,no_pruning"]
-    command += ["--seeds", "3", "--iterations", "8", "--jobs", "1", "--output", str(tmp_path / "out")]
+    command += ["--seeds", "3,3", "--iterations", "8", "--jobs", "1", "--output", str(tmp_path / "out")]
     written = tmp_path / "out" / "runs.jsonl"
     with measured_at_once(), monkeypatch.context() as patch:
         stopped = Mock(side_effect=lambda *given: (append(*given), os.kill(os.getpid(), signal.SIGINT)))
@@ -108,7 +108,7 @@ def test_the_command_trains_shares_priors_and_repeats_nothing(saved_room, tmp_pa
         assert main(command) == 0
     assert written.read_text().startswith(first)
     table = (tmp_path / "out" / "ablation.md").read_text()
-    assert "| Backbone |" in table
+    assert "| Backbone | one seed |" in table, "a seed that is named twice is one"
     assert "| w/o Pruning |" in table
     assert {path.name for path in (tmp_path / "out" / "priors").iterdir()} == {"dual", "dual.seconds.json"}, "one"
     rows = [json.loads(line) for line in written.read_text().splitlines()]

@@ -94,6 +94,10 @@ class TestPlan:
         assert [(row["method"], row["seed"]) for row in more] == [("yang4d backbone", 2), ("yang4d full", 2)]
         assert len(bench(first[:-1], seconds=(10,), seeds=(0, 1))) == 1
 
+    def test_a_seed_that_is_named_twice_is_measured_once(self) -> None:
+        rows = bench([], methods=("backbone",), steps=(20,), seeds=(0, 0, 1))
+        assert [row["seed"] for row in rows] == [0, 1]
+
     def test_the_same_settings_under_a_label_are_measured_as_well(self) -> None:
         first = bench([], seconds=(10,), seeds=(0,))
         labelled = bench(first, seconds=(10,), seeds=(0,), label="mine")

@@ -44,7 +44,7 @@ def ablate(
         for seed in seeds
     ]
     rows = by_key(measure_missing("ablate", works, output / "runs.jsonl", workers))
-    text = report([rows[work.key] for work in works], presets)
+    text = report([rows[key] for key in dict.fromkeys(work.key for work in works)], presets)
     write_text(output / "ablation.md", text)
     return text
 

@@ -24,7 +24,7 @@ from d2_plugin.runs.ablation.presets import PRESETS, TABLES, Preset, rows_named
 from d2_plugin.runs.rows import TRY, Row, case_name, command_line
 from d2_plugin.runs.settings import RunSettings
 from d2_plugin.runs.shared import Shared, share, share_points
-from d2_plugin.runs.training.measured import Line, Work, by_key, follow, rows_in, workers, written
+from d2_plugin.runs.training.measured import Line, Work, by_key, follow, rows_in, unmeasured, workers, written
 from d2_plugin.settings import AtATime, Count, Downscale, Positional, Range, Seed, Settings
 
 PILOT = 100
@@ -102,7 +102,7 @@ def run(
     command = command_line(name, settings)
     with workers(settings.jobs, settings.scheduler) as submit:  # or say that nobody answers, before priors are made
         lines = [line for text in settings.recordings for line in _lines(settings, text, chosen, known, command)]
-        runs = len(lines) * len(settings.seeds) * len(_targets(settings))
+        runs = len(lines) * len(set(settings.seeds)) * len(_targets(settings))
         with written(path, name, runs, **(about or {})) as write:
             follow(lines, submit, write)
     return f"rows are in {path}; `d2 report {path}` draws them"
@@ -180,9 +180,6 @@ def line_of(method: Method, known: Sequence[Row]) -> Line:
     ]
     tried: list[Timed] = [(row["iterations"], row["seconds"]) for row in mine if row["seconds"]]
 
-    def missing(works: Sequence[Work]) -> list[Work]:
-        return [work for work in works if work.key not in by_run]
-
     for kind, size in _targets(settings):
         target, steps = (f"{size:g} s", 0) if kind == "seconds" else (f"{size:g} steps", round(size))
         if not steps:
@@ -192,14 +189,14 @@ def line_of(method: Method, known: Sequence[Row]) -> Line:
                 length = next_steps(size, tried)
                 if any(length == n for n, _ in tried):
                     break
-                rows = yield missing([method.work(length, settings.seeds[0], TRY)])
+                rows = yield unmeasured([method.work(length, settings.seeds[0], TRY)], by_run)
                 if any(row["failed"] for row in rows):
                     return
                 tried += [(row["iterations"], row["seconds"]) for row in rows]
                 if tried and fits(size, tried[-1]):
                     break
             steps = steps or nearest(size, tried)
-        rows = yield missing([method.work(steps, seed, target) for seed in settings.seeds])
+        rows = yield unmeasured([method.work(steps, seed, target) for seed in settings.seeds], by_run)
         if rows and all(row["failed"] for row in rows):
             return
         tried += [(row["iterations"], row["seconds"]) for row in rows if row["seconds"]]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import queue
 import shutil
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from operator import itemgetter
@@ -168,8 +168,7 @@ def follow(lines: Sequence[Line], submit: Submit, on_row: Callable[[Row], None])
 
 def measure_missing(name: str, works: Sequence[Work], path: Path, jobs: int) -> list[Row]:
     """Measure what has no row in the file yet, `jobs` at a time on this machine; all rows of the file."""
-    known = by_key(rows_in(path))
-    missing = [work for work in works if work.key not in known]
+    missing = unmeasured(works, by_key(rows_in(path)))
 
     def line() -> Line:
         yield missing
@@ -177,6 +176,11 @@ def measure_missing(name: str, works: Sequence[Work], path: Path, jobs: int) -> 
     with workers(jobs, None) as submit, written(path, name, len(missing)) as write:
         follow([line()], submit, write)
     return rows_in(path)
+
+
+def unmeasured(works: Iterable[Work], known: Container[tuple[str, ...]]) -> list[Work]:
+    """The works whose key is not known, each once."""
+    return list({work.key: work for work in works if work.key not in known}.values())
 
 
 def rows_in(path: Path) -> list[Row]:
