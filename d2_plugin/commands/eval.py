@@ -29,4 +29,4 @@ def run(settings: Evaluation) -> str:
     from d2_plugin.runs.tables import metrics_table
 
     metrics = Run.load(settings.run_folder).evaluate(images=not settings.no_images)
-    return metrics_table({settings.run_folder.name: metrics})
+    return metrics_table({settings.run_folder.resolve().name: metrics})

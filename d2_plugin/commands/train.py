@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -70,7 +71,7 @@ def run(given: Given) -> str:
         show("background: directions have a colour of their own, behind all Gaussians")
     if live is not None:
         live.stay()
-    table = metrics_table({options.output.name: metrics})
+    table = metrics_table({options.output.resolve().name: metrics})
     where = f"metrics in {options.output / 'metrics.json'}, images in {options.output / 'images'}"
     return "\n".join([table, where, *([] if run.prior is None else [run.prior["headline"]])])
 
@@ -85,7 +86,7 @@ def _imported(given: Given, options: TrainOptions) -> Given:
         _refuse_videos(videos)
         return given
     chosen = ImportChoices.from_dict(table_of_config(given, "import"), "import")
-    folder = options.output.with_name(f"{options.output.name}-recording")
+    folder = Path(f"{os.path.abspath(options.output)}-recording")
     settings = ImportSettings(videos=(videos,), calibration=options.calibration, output=folder, **vars(chosen))
     import_videos(settings, report=show)
     return replace(given, values={**given.values, "recording": str(folder)})

@@ -100,7 +100,9 @@ def viewed_run(folder: Path) -> ViewedRun:
     if not len(trained.model):
         raise D2Error(f"{folder} has no Gaussian left at step {trained.step}: nothing can be shown, train it anew")
     hooks = (load_checkpoint(folder / "checkpoint.pt", "cpu") or {}).get("d2") or {}
-    note = "" if trained.step >= total else f"{folder.name} still trains: this is step {trained.step} of {total}"
+    note = (
+        "" if trained.step >= total else f"{folder.resolve().name} still trains: this is step {trained.step} of {total}"
+    )
     adapter: Any = registry.load(registry.ADAPTERS, run.settings.backbone)
     scores: dict[str, float] = {}
     if (folder / "metrics.json").is_file() and (table := read_metrics(folder))["test"] is not None:
@@ -119,7 +121,7 @@ def viewed_training(run: Run, trainer: Any) -> ViewedRun:
 def _of_run(run: Run, backbone: Any, inserted_at: Tensor | None) -> ViewedRun:
     path = run.folder / "points.npz"
     return ViewedRun(
-        run.folder.name,
+        run.folder.resolve().name,
         run.scene.recording,
         run.scene.train_cameras,
         run.scene.test_cameras,

@@ -21,6 +21,7 @@ from d2_plugin.recordings.export.folder import save_recording
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.store.store import PriorStore
 from d2_plugin.viewing import demo
+from d2_plugin.viewing.viewed import viewed_run
 
 pytest.importorskip("pycolmap", reason="pycolmap is in the `stereo` extra")
 pytest.importorskip("cv2", reason="opencv is in the `image` extra")
@@ -71,6 +72,14 @@ def test_evaluating_again_gives_the_same_scores(finished: Path) -> None:
     assert main(["eval", str(finished), "--no-images"]) == 0
     after = json.loads((finished / "metrics.json").read_text())
     assert (after["test"], after["per_view"]) == (before["test"], before["per_view"])
+
+
+def test_a_run_in_the_current_folder_has_its_name(finished: Path, tmp_path, answered, monkeypatch) -> None:
+    monkeypatch.chdir(shutil.copytree(finished, tmp_path / "full"))
+    assert "\n| full | " in answered("eval", ".", "--no-images")
+    answered("report", ".", "--output", "page", "--no-images")
+    assert "--output full" in (tmp_path / "full" / "page" / "report.md").read_text()
+    assert viewed_run(Path()).name == "full"
 
 
 def test_priors_are_built_in_parts_and_shown_on_a_sheet(

@@ -106,5 +106,5 @@ def collect(sources: Sequence[Path]) -> tuple[list[Row], list[Image]]:
         metrics = read_metrics(folder)
         key = (metrics["recording"], method_of(metrics))
         if key not in first and (image := image_of(folder)) is not None:
-            first[key] = Image(f"{', '.join(key)}: {image[0]} of run {folder.name}", image[1])
+            first[key] = Image(f"{', '.join(key)}: {image[0]} of run {folder.resolve().name}", image[1])
     return rows, [first[key] for key in sorted(first)]

@@ -157,10 +157,10 @@ def words(filmed: Filmed, run: Path, *more: str) -> list[str]:
     return [*given, "--output", str(run), "--import.scale", "0.2", *more]
 
 
-def test_four_real_videos_become_a_scene(pose2sim: Callable[[int], Filmed], tmp_path: Path, capsys, answered) -> None:
-    run = tmp_path / "run"
-    command = words(pose2sim(4), run, "--import.offsets", "none", "--import.frames", "0:3:3", "--hooks", "none")
-    assert "8 images of 4 cameras" in answered(*command, "--iterations", "20")
+def test_four_real_videos_become_a_scene(pose2sim, tmp_path: Path, capsys, answered, monkeypatch) -> None:
+    run, filmed = tmp_path / "run", pose2sim(4)
+    more = ("--import.offsets", "none", "--import.frames", "0:3:3", "--hooks", "none", "--iterations", "20")
+    assert "8 images of 4 cameras" in answered(*words(filmed, run, *more))
     metrics = json.loads((run / "metrics.json").read_text())
     assert metrics["test"] is None
     assert metrics["train"]["psnr"] > 8
@@ -169,7 +169,8 @@ def test_four_real_videos_become_a_scene(pose2sim: Callable[[int], Filmed], tmp_
     recording = open_recording(tmp_path / "run-recording")
     assert {(camera.width, camera.height) for camera in recording.cameras.values()} == {(72, 128)}
     before = (run / "checkpoint.pt").read_bytes()
-    assert main([*command, "--iterations", "20"]) == 0  # every step is there already
+    monkeypatch.chdir(run)
+    assert main(words(filmed, Path("."), *more)) == 0  # every step is there already
     assert "write images" not in capsys.readouterr().out
     assert (run / "checkpoint.pt").read_bytes() == before
 
