@@ -59,7 +59,7 @@ def run(given: Given) -> str:
     summary = build_priors_for(scene, points.positions, options.output, shard=shard, cluster=cluster)
     show(str(summary), summary.headline())
     folder = summary.folder or options.output
-    if folder != options.output:
+    if folder.absolute() != options.output.absolute():  # a cluster says whole paths
         show_notes([f"{options.output} holds the priors of other cameras, which stay; those of these are in {folder}"])
     if shard is not None:
         return f"part {options.shard} of the prior is in {folder}"

@@ -105,6 +105,14 @@ def test_priors_are_built_in_parts_and_shown_on_a_sheet(
         assert np.array_equal(whole.prior(camera, 1).depth, joined.prior(camera, 1).depth)
 
 
+def test_workers_build_into_a_folder_named_from_here(finished: Path, recording: Path, answered, monkeypatch) -> None:
+    pytest.importorskip("distributed", reason="dask.distributed is in the `cluster` extra")
+    monkeypatch.chdir(finished)
+    monkeypatch.setattr("d2_plugin.runs.prior.trials.can_decide", lambda *_: False)
+    told = answered("priors", recording, "--train-cameras", CAMERAS, "--output", "priors", "--workers", "1")
+    assert "of other cameras" not in told
+
+
 def test_a_hook_that_changes_nothing_retires_and_the_scores_say_so(recording, finished, tmp_path, capsys) -> None:
     config = tmp_path / "config.toml"
     config.write_text("[d2]\nretire_after = 2\n[densify]\nmax_gaussians = 0\n")
