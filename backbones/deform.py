@@ -164,7 +164,7 @@ class Deform(SplatModel):
         """Continue from `state_dict()`."""
         super().load_state_dict(state["gaussians"])
         if self.field is not None:
-            self.field.load_state_dict(state["field"])
+            self.field.load_state_dict({"unit": self.field.unit} | state["field"])  # versions before saved no unit
             self.field_optimizer.load_state_dict(deepcopy(state["field_optimizer"]))
             self._generator.set_state(state["generator"].cpu())
             self._noise = state["noise"]

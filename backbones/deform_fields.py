@@ -85,12 +85,14 @@ class HexPlaneField(nn.Module):
 
     centre: Tensor
     reach: Tensor
+    unit: Tensor
 
     def __init__(self, box: Box, settings: HexPlaneSettings, generator: torch.Generator) -> None:
         super().__init__()
         self.register_buffer("centre", box.centre.detach().clone())
         self.register_buffer("reach", box.reach.detach().clone())
-        self.unit, self.settings = box.unit, settings
+        self.register_buffer("unit", torch.tensor(box.unit))
+        self.settings = settings
         channels, instants = settings.features, settings.instants
         grids = [torch.empty(3, channels, r, r).uniform_(0.1, 0.5, generator=generator) for r in settings.resolutions]
         self.space = nn.ParameterList(grids)

@@ -27,7 +27,7 @@ from d2_plugin.runs.rows import circumstances
 from d2_plugin.runs.scene import Guidance, Scene
 from d2_plugin.runs.settings import HOOK_NAMES, RunSettings, check, hook_config, hooks_in_use
 from d2_plugin.runs.shared import COST
-from d2_plugin.runs.start import TimedPoints, triangulated_points, with_stereo
+from d2_plugin.runs.start import FROM_STEREO, TimedPoints, triangulated_points, with_stereo
 from d2_plugin.store.store import PriorStore
 from d2_plugin.values import checked_arguments
 
@@ -191,8 +191,10 @@ class Run:
         elif attach:
             config, scene = hook_config(self.settings, self.priors), self.scene
             if config.densify is not None and config.believe != "nothing":
-                prior = PriorStore.open(self.priors).prior
-                start = with_stereo(start, scene.recording, scene.train_cameras, prior, self.settings.seed)
+                prior, most = PriorStore.open(self.priors).prior, FROM_STEREO
+                if (limit := config.densify.max_gaussians) is not None:
+                    most = min(most, max(limit - len(start), 0))
+                start = with_stereo(start, scene.recording, scene.train_cameras, prior, self.settings.seed, most)
         hooks = self._attach if attach and self.uses_prior else None
         return self.scene.trainer(self.settings, triangulated, start, hooks, appearance=attach)
 

@@ -257,14 +257,15 @@ def with_stereo(
     cameras: Sequence[str],
     prior: Callable[[str, int], DepthPrior | None],
     seed: int = 0,
+    most: int = FROM_STEREO,
 ) -> TimedPoints:
-    """The points, and up to `FROM_STEREO` verified pixels of the priors, as many of each view at five instants."""
+    """The points, and up to `most` verified pixels of the priors, as many of each view at five instants."""
     views, rng = list(itertools.product(spread(recording.frames, 5), cameras)), np.random.default_rng(seed)
     parts = [points]
     for frame, camera in views:
         if (known := prior(camera, frame)) is not None:
             pixels = np.argwhere((known.labels == Label.VERIFIED).numpy())
-            rows, columns = rng.permutation(pixels)[: FROM_STEREO // len(views)].T
+            rows, columns = rng.permutation(pixels)[: most // len(views)].T
             parts.append(_back_projected(recording, camera, frame, rows, columns, known.depth.numpy()[rows, columns]))
     return TimedPoints.joined(parts)
 

@@ -127,6 +127,18 @@ def bilinear(plane: torch.Tensor, row: torch.Tensor, column: torch.Tensor) -> to
     return sum(corners).T
 
 
+def test_a_checkpoint_says_in_what_the_offsets_are_measured() -> None:
+    """A run that is opened again to be scored has no prior, and without one may find another extent."""
+    trained, opened = deforming(), make_model(backbone="deform")
+    opened.field = HexPlaneField(Box(torch.zeros(3), torch.ones(3), 7.0), opened.settings.hexplane, opened._generator)
+    state = trained.state_dict()
+    opened.load_state_dict(state)
+    positions = trained.gaussians["positions"]
+    assert torch.equal(opened.offsets(positions, 0.3).positions, trained.offsets(positions, 0.3).positions)
+    del state["field"]["unit"]  # of a version before
+    trained.load_state_dict(state)
+
+
 class TestField:
     def test_passes_gradcheck(self) -> None:
         field, positions = make_field(), some_positions(3)

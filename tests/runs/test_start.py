@@ -127,6 +127,7 @@ def test_a_run_that_inserts_starts_on_what_stereo_verified(recording) -> None:
     def prior(camera: str, frame: int) -> DepthPrior | None:
         return None if frame == 1 else DepthPrior(torch.from_numpy(recording.depth(camera, frame)), labels)
 
+    assert len(with_stereo(sparse, recording, CAMERAS, prior, most=40)) == 50 + 4 * (40 // 6)
     start = with_stereo(sparse, recording, CAMERAS, prior)
     share = FROM_STEREO // 6  # three frames of two cameras
     assert len(start) == 50 + 4 * share

@@ -274,6 +274,17 @@ def test_a_run_that_inserts_starts_on_stereo(settings, tmp_path, tried, monkeypa
     assert bool(asked) is starts
 
 
+@pytest.mark.parametrize(("limit", "most"), [(None, 12_000), (3000, 2900), (50, 0)])
+def test_no_more_gaussians_than_the_user_allows_start(settings, tmp_path, tried, monkeypatch, limit, most) -> None:
+    asked: list[int] = []
+    monkeypatch.setattr("d2_plugin.runs.run.with_stereo", lambda points, *rest: asked.append(rest[-1]) or points)
+    limited = {} if limit is None else {"overrides": {"densify": {"max_gaussians": limit}}}
+    run = run_of(replace(settings, **limited), tmp_path / "run")
+    run.prepare()
+    run._trainer(TimedPoints(np.ones((100, 3)), np.ones((100, 3)), np.zeros(100)))
+    assert asked == [most]
+
+
 RECORDINGS = [
     ("dome", ("03", "07", "12", "15"), (10, 20, 30), NETWORK, "stereo"),
     ("studio", ("00", "02", "05", "07"), (5, 10, 15), None, "all"),
