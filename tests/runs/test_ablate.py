@@ -126,3 +126,10 @@ def test_the_command_trains_shares_priors_and_repeats_nothing(saved_room, tmp_pa
         write_grey(path, 99, (96, 54))  # another recording in a folder of the same name
     assert "holds a run of `d2 train`: give" in refused(*command[:-1], str(next(iter(checkpoints)).parent))
     assert "of another frames, recording: give" in refused(*command, "--rows", "no_rgbd", "--frames", "0")
+
+
+def test_without_a_camera_held_out_nothing_is_trained(saved_room, tmp_path, refused) -> None:
+    room = saved_room(cameras=2, held_out=1, frames=2, width=96, height=54)
+    said = refused("ablate", str(room), "--train-cameras", "all", "--output", str(tmp_path / "out"))
+    assert "leave one out of --train-cameras" in said
+    assert not (tmp_path / "out").exists()

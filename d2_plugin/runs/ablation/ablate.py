@@ -7,8 +7,10 @@ from dataclasses import replace
 from pathlib import Path
 
 from d2_plugin.durable import write_text
+from d2_plugin.errors import D2Error
 from d2_plugin.runs.ablation.presets import PRESETS, PUBLISHED, TABLES, Preset
 from d2_plugin.runs.rows import Row, case_name
+from d2_plugin.runs.scene import Scene
 from d2_plugin.runs.settings import RunSettings, prior_settings
 from d2_plugin.runs.shared import Shared, share, share_points
 from d2_plugin.runs.tables import STUDY_COLUMNS, Table, markdown
@@ -35,7 +37,12 @@ def ablate(
 
     `base` gives recording, cameras, iterations and the user's own tables, and `command`, for the rows, is how this was
     started. Runs with the same variant of the prior share one.
+
+    Raises:
+        D2Error: no camera is held out.
     """
+    if not Scene.open(base).test_cameras:
+        raise D2Error("all cameras train, so no run can be scored: leave one out of --train-cameras")
     output = output.absolute()
     works = [
         _work(base, backbone, preset, seed, output, command)
