@@ -6,7 +6,7 @@ import functools
 import inspect
 import math
 import types
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, is_dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, Union, cast, get_args, get_origin
@@ -115,6 +115,8 @@ def _as_kind(kind: Any, limits: Range, value: Any, name: str) -> Any:
         return tuple(_checked(*_inner(item, limits), one, f"an item of {name}") for one in value)
     if kind in (int, float):
         return _as_number(kind, limits, value, name)
+    if kind is str and isinstance(value, Path):
+        return str(value)
     if kind is Path and isinstance(value, (str, Path)) and str(value) != "" and "\0" not in str(value):
         return Path(value)  # no text at all would be the current folder, and a zero byte ends a name
     if kind is Path or origin in LISTS:
@@ -158,7 +160,7 @@ def _as_number(kind: type, limits: Range, value: Any, name: str) -> int | float:
 
 
 def _as_tuple(kinds: Sequence[Any], limits: Range, value: Any, name: str) -> tuple[Any, ...]:
-    if not isinstance(value, (list, tuple)):
+    if not isinstance(value, Collection) or isinstance(value, (str, bytes, Mapping, Set)):
         raise _wrong(name, "must be a list", value)
     endless = len(kinds) == 2 and kinds[1] is Ellipsis
     if not endless and len(value) != len(kinds):

@@ -131,6 +131,10 @@ def test_whole_numbers_become_floats_and_lists_tuples() -> None:
     assert (made.weight, made.levels, made.bounds, made.folder) == (2.0, (3, 4), (1.0, 2.0), Path("a/b"))
     assert isinstance(made.weight, float)
     assert isinstance(Example(start=np.int64(3)).start, int)
+    assert Example(levels=range(3, 5)).levels == Example(levels=np.array([3, 4])).levels == (3, 4)
+    assert Example(name=Path("a/b")).name == "a/b"
+    for unordered in ({3, 4}, {3: 4}, "34", iter([3, 4])):
+        refuses("levels must be a list", Example, levels=unordered)
 
 
 @pytest.mark.parametrize(
