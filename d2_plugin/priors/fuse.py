@@ -18,7 +18,8 @@ VARIANTS: tuple[Variant, ...] = get_args(Variant)
 EPSILON = 1e-9
 """The paper's eps, world units."""
 CONFIRMS, NEAR = 2.0, 0.1
-"""A map confirms a match that no other view does within so many of its sigmas and within this relative difference."""
+"""A map confirms a match that no other view does within so many of its sigmas, where these are less than that: one
+that is hardly known agrees with anything."""
 SURER, SUREST = 0.25, 0.005
 """Sigma of such a match: this share of the map's and of how far the two are apart, and no less than that."""
 
@@ -111,9 +112,9 @@ def with_matches(maps: FusedPrior, mono: np.ndarray, sigma: np.ndarray, unconfir
     takes the place of the map's depth, which is not as exact, or of nothing, at an edge that the map blurs. Its sigma
     says that it had one witness: a share of the relative `sigma` of the map and of how far the two are apart.
     """
-    known = (mono > 0) & (unconfirmed > 0) & (sigma < np.inf)
+    known = (mono > 0) & (unconfirmed > 0) & (CONFIRMS * sigma < NEAR)
     apart = np.abs(np.log(np.where(known, unconfirmed, 1) / np.where(known, mono, 1)))
-    found = known & (apart < np.fmin(CONFIRMS * sigma, NEAR))
+    found = known & (apart < CONFIRMS * sigma)
     return replace(
         maps,
         depth=np.where(found, unconfirmed, maps.depth),

@@ -125,10 +125,9 @@ def evaluate(
         truth = torch.from_numpy(recording.image(camera, frame).astype(np.float32) / 255)
         color, depth = _checked(render(camera, frame), truth.shape, camera, frame)
         true_depth = recording.depth(camera, frame)
-        moving = None if still is None else np.abs(truth.numpy() - still).max(-1) > CHANGED
         compared = metrics.Compared(
             *(color, truth, depth, None if true_depth is None else torch.from_numpy(true_depth)),
-            moving if moving is not None and moving.mean() > MOVING_SHARE else None,
+            what_moves(truth.numpy(), still),
             *(None if before is None else before[1:], networks, _inside(recording, camera, frame)),
         )
         scores = {name: metric.score(compared) for name, metric in metrics.METRICS.items()}
@@ -157,6 +156,13 @@ def still_image(recording: Recording, camera: str, frames: Sequence[int]) -> np.
     if len(frames) < 3:
         return None
     return np.median([recording.image(camera, f) for f in spread(frames, 9)], axis=0).astype(np.float32) / 255
+
+
+def what_moves(image: np.ndarray, still: np.ndarray | None) -> np.ndarray | None:
+    """The pixels [H, W] of an image [H, W, 3] in 0..1 that differ from what its camera sees where nothing moves; None
+    where nearly none do, or that is not known."""
+    moving = None if still is None else np.abs(image - still).max(-1) > CHANGED
+    return moving if moving is not None and moving.mean() > MOVING_SHARE else None
 
 
 def _inside(recording: Recording, camera: str, frame: int) -> np.ndarray | None:

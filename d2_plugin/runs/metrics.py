@@ -71,8 +71,10 @@ def _corrected(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
     return min(corrected, image, key=lambda one: float(np.square(one - truth).sum()))
 
 
-def ssim_uniform(image: Tensor, truth: Tensor, data_range: float = 1.0) -> float:
+def ssim_uniform(image: Tensor, truth: Tensor, data_range: float = 1.0, within: np.ndarray | None = None) -> float:
     """Scikit-image's structural similarity: uniform 7x7 window, sample covariance, mean over windows inside the image.
+
+    `within` [H, W] bool are the pixels whose windows count, all where None; nan where there is none inside.
 
     >>> image = torch.rand(8, 9, 3)
     >>> round(ssim_uniform(image, image), 6)
@@ -81,7 +83,7 @@ def ssim_uniform(image: Tensor, truth: Tensor, data_range: float = 1.0) -> float
     first, second = _pair(image, truth, UNIFORM_WINDOW)
     count = UNIFORM_WINDOW**2
     taps = [1 / UNIFORM_WINDOW] * UNIFORM_WINDOW
-    return _ssim(first, second, taps, data_range, unbias=count / (count - 1))
+    return _ssim(first, second, taps, data_range, count / (count - 1), within)
 
 
 def ssim_3dgs(image: Tensor, truth: Tensor) -> float:
@@ -155,16 +157,29 @@ def _known_depths(depth: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
     return torch.where(torch.isfinite(rendered), rendered, 0.0), truth[known].double()
 
 
-def _ssim(image: np.ndarray, truth: np.ndarray, taps: Sequence[float], data_range: float, unbias: float) -> float:
+def _ssim(
+    image: np.ndarray,
+    truth: np.ndarray,
+    taps: Sequence[float],
+    data_range: float,
+    unbias: float,
+    within: np.ndarray | None = None,
+) -> float:
     """Mean SSIM over windows inside the images [3, H, W]; `unbias` turns window variances into sample variances.
 
     Goes over the image in strips, which stay in the processor's cache and keep memory small for large images.
     """
     margin = len(taps) - 1
-    rows = image.shape[1] - margin
-    strips = [slice(start, min(start + STRIP_ROWS, rows) + margin) for start in range(0, rows, STRIP_ROWS)]
-    total = sum(_similarity(image[:, s], truth[:, s], taps, data_range, unbias).sum() for s in strips)
-    return float(total) / (image.shape[0] * rows * (image.shape[2] - margin))
+    centres = slice(margin // 2, -(margin // 2))
+    rows, columns = image.shape[1] - margin, image.shape[2] - margin
+    counted = np.ones((rows, columns), bool) if within is None else within[centres, centres]
+    total = 0.0
+    for start in range(0, rows, STRIP_ROWS):
+        strip = slice(start, min(start + STRIP_ROWS, rows) + margin)
+        similar = _similarity(image[:, strip], truth[:, strip], taps, data_range, unbias)
+        total += float(similar.sum() if within is None else similar[:, counted[start : start + STRIP_ROWS]].sum())
+    count = image.shape[0] * int(counted.sum())
+    return total / count if count else math.nan
 
 
 def _similarity(

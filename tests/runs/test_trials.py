@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import cycle
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -13,10 +14,19 @@ from tiny import make_model
 from d2_plugin.config import D2Config
 from d2_plugin.hooks.prior import PriorLoader, believed
 from d2_plugin.priors.summary import PriorSummary
-from d2_plugin.protocol import DepthPrior, Label
+from d2_plugin.protocol import DepthPrior, Label, View
 from d2_plugin.recordings import Recording, open_recording
+from d2_plugin.runs.evaluation import still_image, what_moves
 from d2_plugin.runs.plan import Decision
-from d2_plugin.runs.prior.trials import Trials, can_decide, leave_out_in_turn, left_out, small_prior
+from d2_plugin.runs.prior.trials import (
+    Likeness,
+    Trials,
+    _Trial,
+    can_decide,
+    leave_out_in_turn,
+    left_out,
+    small_prior,
+)
 from d2_plugin.runs.run import Run
 from d2_plugin.runs.settings import RunSettings
 from d2_plugin.runs.start import TimedPoints, with_stereo
@@ -26,7 +36,7 @@ from d2_plugin.store.store import PriorStore
 NETWORK = "mobile_pydnet.onnx"
 TRAINED, WIDTH, HEIGHT = ("train0", "train1", "train2"), 128, 72
 NO_POINTS = TimedPoints(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
-GOOD, BAD = 0.8, 0.7
+GOOD, BAD = Likeness(20.0, 0.8), Likeness(19.0, 0.7)
 
 
 def test_what_is_believed_proposes_supervises_and_keeps_space_free_all_stereo_alone_or_nothing() -> None:
@@ -57,53 +67,91 @@ def test_a_small_image_gets_the_depth_of_the_middle_of_its_pixels_and_their_mean
     torch.testing.assert_close(small.colors[0, :, 0].float(), means, atol=0.5, rtol=0)
 
 
-def test_ssim_at_left_out_cameras_decides_and_one_line_says_so() -> None:
-    helps, harms = Trials({"a": GOOD}, {"a": BAD}, 0.0, 1.0), Trials({"a": BAD}, {"a": GOOD}, 9.0, 1.0)
+def test_what_predicts_left_out_cameras_better_is_used_and_one_line_says_so() -> None:
+    helps, harms = Trials({"a": GOOD}, {"a": BAD}, 1.0), Trials({"a": BAD}, {"a": GOOD}, 1.0)
     assert (helps.choice, harms.choice) == ("all", "stereo")
-    assert "confirms stereo, which alone is used (left-out cameras: SSIM 0.700 with it, 0.800 without)" in str(harms)
+    said = "left-out cameras, and what moves there: 19.00 dB, SSIM 0.700 with it; 20.00 dB, SSIM 0.800 without"
+    assert f"confirms stereo, which alone is used ({said})" in str(harms)
     assert "the whole prior is used" in str(helps)
     assert harms.as_dict()["ssim"] == {"all": {"a": 0.7}, "stereo": {"a": 0.8}}
+    assert harms.as_dict()["psnr"] == {"all": {"a": 19.0}, "stereo": {"a": 20.0}}
 
 
 def test_where_a_network_adds_nothing_stereo_alone_is_used() -> None:
     """Both are the same training then: what is simpler is said."""
-    same = Trials({"a": GOOD}, {"a": GOOD}, 0.0, 1.0)
-    assert same.choice == "stereo"
-    assert "trials are level, and there is too little stereo to leave some out" in str(same)
+    assert Trials({"a": GOOD}, {"a": GOOD}, 1.0).choice == "stereo"
 
 
-@pytest.mark.parametrize(
-    ("ahead", "gain", "choice"),
-    [
-        (-0.004, 3.9, "all"),
-        (-0.004, 2.5, "stereo"),
-        (0.004, 2.5, "stereo"),
-        (-0.007, 4.1, "all"),
-        (-0.011, 3.9, "stereo"),
-        (0.011, 0.0, "all"),
-    ],
-)
-def test_in_a_tie_the_maps_are_used_where_they_are_good(ahead: float, gain: float, choice: str) -> None:
-    """*studio* and *dome* 02 07 22: level in trials, not after 2000 steps."""
-    trials = Trials({"a": GOOD + ahead}, {"a": GOOD}, gain, 1.0)
-    assert trials.choice == choice
-    assert ("trials are level, and depth is" in str(trials)) == (abs(ahead) < 0.01)
+def test_what_stands_at_a_wrong_place_counts_where_ssim_forgives_it() -> None:
+    """One instant of *dome* 03 12 18: SSIM rises by .004 to .009, PSNR falls by 2 dB, and so it is after 1000 steps."""
+    wrong = Likeness(GOOD.psnr - 2.0, GOOD.ssim + 0.009)
+    assert Trials({"a": wrong}, {"a": GOOD}, 1.0).choice == "stereo"
 
 
-@pytest.mark.parametrize(("ahead", "asked"), [(0.015, 4), (0.025, 2)])
-def test_one_camera_decides_where_it_is_clear_else_the_mean_of_two(ahead, asked, monkeypatch) -> None:
-    """*dome* 02 12 15 18: the first camera finds the whole prior better by .010, the second worse by .017."""
-    scores = iter([GOOD + ahead, GOOD, GOOD - 2 * ahead, GOOD])
+@pytest.mark.parametrize(("ahead", "asked"), [(0.012, 6), (0.018, 4), (0.04, 2)])
+def test_cameras_are_left_out_until_it_is_clear(ahead, asked, monkeypatch) -> None:
+    """The mean of those so far, with the second one twice as much: .012 .018 .015 of three, .018 and .027, .04."""
+    scores = iter([GOOD.ssim + ahead, GOOD.ssim, GOOD.ssim + 2.5 * ahead, GOOD.ssim, GOOD.ssim, GOOD.ssim])
     made: list[object] = []
-    trial = SimpleNamespace(model=lambda *_: made.append(0), score=lambda *_: next(scores), gain=0.0)
+    seen = lambda *_: Likeness(GOOD.psnr, next(scores))  # noqa: E731
+    trial = SimpleNamespace(model=lambda *_: made.append(0), likeness=seen)
     monkeypatch.setattr("d2_plugin.runs.prior.trials._Trial.of", lambda *_: trial)
     trials = leave_out_in_turn(None, SimpleNamespace(train_cameras=TRAINED), NO_POINTS, None)
     assert len(made) == asked
-    assert trials.choice == ("stereo" if asked == 4 else "all")
+    assert trials.choice == "all"
 
 
-@pytest.mark.parametrize(("cameras", "chosen"), [("ab", "ab"), ("abc", "ac"), ("abcd", "bd"), ("abcdefgh", "cg")])
-def test_however_many_cameras_there_are_two_are_left_out_so_that_trials_cost_the_same(cameras, chosen) -> None:
+@pytest.mark.parametrize(
+    ("cameras", "behind", "choice"), [(2, 0.007, "all"), (2, 0.038, "stereo"), (3, 0.007, "stereo")]
+)
+def test_either_of_two_cameras_trains_alone_and_so_the_prior_may_predict_the_other_worse(
+    cameras, behind, choice, monkeypatch
+) -> None:
+    """*studio* with good maps, and with PyDNet's: 1.2 dB better with them, 2.6 without, after 2000 steps."""
+    likeness = cycle([Likeness(GOOD.psnr, GOOD.ssim - behind), GOOD])
+    trial = SimpleNamespace(model=lambda *_: None, likeness=lambda *_: next(likeness))
+    monkeypatch.setattr("d2_plugin.runs.prior.trials._Trial.of", lambda *_: trial)
+    trials = leave_out_in_turn(None, SimpleNamespace(train_cameras=TRAINED[:cameras]), NO_POINTS, None)
+    assert trials.choice == choice
+
+
+class Blurred:
+    """Renders each image of a recording as it is, but for what moves, which is grey."""
+
+    def __init__(self, recording: Recording, mean: float) -> None:
+        self.recording, self.mean = recording, mean
+
+    def render(self, view: View) -> SimpleNamespace:
+        image = torch.from_numpy(self.recording.image(view.camera, view.frame)).float() / 255
+        still = still_image(self.recording, view.camera, self.recording.frames)
+        moves = what_moves(image.numpy(), still)
+        image[torch.from_numpy(moves)] = self.mean
+        return SimpleNamespace(color=image)
+
+
+def test_what_moves_counts_as_much_as_the_whole_image(saved_room: Callable[..., Path], tmp_path: Path) -> None:
+    room = saved_room(cameras=3, held_out=0, frames=4, width=WIDTH, height=HEIGHT)
+    settings = RunSettings(str(room), TRAINED)
+    scene = Run(settings, tmp_path / "run").scene
+    trial = _Trial(settings, scene, NO_POINTS, None)
+    recording, camera = scene.recording, TRAINED[0]
+    seen = trial.likeness(Blurred(recording, 0.5), camera)
+    images = [torch.from_numpy(recording.image(camera, frame)).float() / 255 for frame in recording.frames]
+    still = still_image(recording, camera, recording.frames)
+    squared, share = [], []
+    for image in images:
+        moves = np.abs(image.numpy() - still).max(-1) > 12 / 255
+        squared.append(float(((image - 0.5) ** 2)[torch.from_numpy(moves)].mean()))
+        share.append(moves.mean())
+    whole = np.mean([-10 * np.log10(error * part) for error, part in zip(squared, share)])
+    moving = np.mean([-10 * np.log10(error) for error in squared])
+    assert 0 < max(share) < 0.3
+    assert seen.psnr == pytest.approx((whole + moving) / 2, abs=1e-3)
+    assert seen.ssim < 0.75, "the whole image alone is nearly right"
+
+
+@pytest.mark.parametrize(("cameras", "chosen"), [("ab", "ba"), ("abc", "bac"), ("abcd", "bdac"), ("abcdefgh", "dhbf")])
+def test_however_many_cameras_there_are_at_most_four_are_left_out_those_apart_first(cameras, chosen) -> None:
     assert left_out(tuple(cameras)) == tuple(chosen)
 
 
@@ -123,8 +171,7 @@ def stored(folder: Path, recording: Recording, wrong: float) -> Path:
             labels = np.where(verified, Label.VERIFIED, Label.MONO).astype(np.uint8)
             sigma = np.where(verified, 0.003, 0.1).astype(np.float32)
             prior = FusedPrior((truth * off).astype(np.float32), labels, sigma, recording.image(camera, frame))
-            skill = {"error": 0.1, "gain": 2.0 + number}
-            made.write(camera, frame, prior, {"key": "k", "shares": prior.shares(), "skill": skill})
+            made.write(camera, frame, prior, {"key": "k", "shares": prior.shares()})
     return folder
 
 
@@ -136,7 +183,6 @@ def test_depth_is_believed_if_it_is_right_whatever_its_sigma(room, tmp_path, wro
     store = PriorStore.open(stored(tmp_path / "priors", scene.recording, wrong))
     trials = leave_out_in_turn(settings, scene, NO_POINTS, store)
     assert trials.choice == choice
-    assert trials.gain == 3.0, "the median of the views"
 
 
 def test_a_trial_begins_on_stereo_of_the_cameras_that_train_it_and_of_no_other(room, tmp_path, monkeypatch) -> None:
@@ -152,7 +198,8 @@ def test_a_trial_begins_on_stereo_of_the_cameras_that_train_it_and_of_no_other(r
     settings = RunSettings(str(room), TRAINED)
     scene = Run(settings, tmp_path / "run").scene
     leave_out_in_turn(settings, scene, NO_POINTS, PriorStore.open(stored(tmp_path / "priors", scene.recording, 0.0)))
-    assert [cameras for cameras, _ in begun] == 2 * [["train1", "train2"]] + 2 * [["train0", "train1"]]
+    others = (["train0", "train2"], ["train1", "train2"], ["train0", "train1"])
+    assert [cameras for cameras, _ in begun] == [names for names in others for _ in range(2)]
     assert all(count > 1000 for _, count in begun)
 
 
@@ -163,7 +210,7 @@ def tried(monkeypatch: pytest.MonkeyPatch) -> list[RunSettings]:
 
     def told(settings: RunSettings, *_: object) -> Trials:
         made.append(settings)
-        return Trials({"a": BAD}, {"a": GOOD}, 0.0, 1.0)
+        return Trials({"a": BAD}, {"a": GOOD}, 1.0)
 
     monkeypatch.setattr("d2_plugin.runs.prior.trials.leave_out_in_turn", told)
     summary = PriorSummary(views={("a", 0): {"shares": {"verified": 1.0}, "sigmas": {}, "refused": None}})
@@ -222,10 +269,10 @@ def test_other_depth_fills_the_gaps_without_parallax(settings, tmp_path, monkeyp
     assert config.motion is not None
 
 
-def test_one_of_two_cameras_would_train_alone_so_two_cameras_get_no_trial(room: Path, tmp_path: Path) -> None:
+def test_one_camera_alone_predicts_no_other(room: Path, tmp_path: Path) -> None:
     run = run_of(RunSettings(str(room), TRAINED), tmp_path / "run")
-    assert can_decide(run.settings, run.scene)
-    assert not can_decide(run.settings, replace(run.scene, train_cameras=TRAINED[:2]))
+    assert can_decide(run.settings, replace(run.scene, train_cameras=TRAINED[:2]))
+    assert not can_decide(run.settings, replace(run.scene, train_cameras=TRAINED[:1]))
     chosen = replace(run.settings, overrides={"d2": {"believe": "stereo"}})
     assert not can_decide(chosen, run.scene), "in `d2 bench training` and `d2 priors` as in `d2 train`"
 

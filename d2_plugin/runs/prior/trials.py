@@ -3,9 +3,9 @@
 A declared error, however honest, does not say whether a depth helps cameras that nobody trained on: that also depends
 on what would stand there without it. A training camera shows it as long as it is left out: the others are trained for
 a moment on small images, once with the whole prior and once with its stereo alone, and what the left-out camera would
-see is compared with its images. Where the first one does not decide clearly a second one is left out. SSIM decides:
-single floaters and colours that cameras see differently weigh less in it than in PSNR. Where that is level, maps are
-used if they are good where stereo was left out of their alignment.
+see is compared with its images: the whole images and what moves in them, which a network may know less well, alike.
+SSIM sees lost detail, and PSNR what stands at a wrong place; both count. Cameras are left out in turn until it is
+clear.
 
 The prior is the run's own, so a trial costs its training and no more. Stereo of the left-out camera's images is in it,
 for both beliefs alike.
@@ -14,12 +14,12 @@ for both beliefs alike.
 from __future__ import annotations
 
 import contextlib
+import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from statistics import median
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -33,7 +33,8 @@ from d2_plugin.plugin import D2Hooks
 from d2_plugin.progress import progress_bar
 from d2_plugin.protocol import DepthPrior
 from d2_plugin.recordings import open_recording
-from d2_plugin.runs.metrics import ssim_uniform
+from d2_plugin.runs.evaluation import still_image, what_moves
+from d2_plugin.runs.metrics import NO_DIFFERENCE, psnr, ssim_uniform
 from d2_plugin.runs.scene import Scene
 from d2_plugin.runs.settings import HOOK_NAMES, RunSettings, hook_config
 from d2_plugin.runs.start import TimedPoints, make_view, with_stereo
@@ -41,67 +42,88 @@ from d2_plugin.store.store import TRIALS, PriorStore
 
 LEAST_ITERATIONS = 300
 """Of a run that makes trials; a shorter one would take less time than they, and only knows what was tried before."""
-LEAST_CAMERAS = 3
-"""Without one of two cameras, one would train alone: that shows nothing of what two show."""
+LEAST_CAMERAS = 2
+ALONE = 0.02
+"""How much worse the whole prior may predict either of two cameras from the other: one alone trains worse with it than
+two do."""
 STEPS = 200
 """Of one trial. What is inserted begins faint, and a trial that is too short sees its cost alone."""
 SIDE = 320
 """Pixels of the longer side of the images in a trial, at least. On fewer, errors of depth are too small to be seen."""
 INSTANTS = 4
 """Of the recording in a trial, evenly spread."""
-MOST_LEFT_OUT = 2
+MOST_LEFT_OUT = 4
 """Cameras that are left out, spread evenly in the order in which they are named."""
-CLEAR = 0.02
-"""A difference of SSIM at one left-out camera that needs no second one."""
-TIE = 0.01
-"""A mean difference of SSIM below which it does not decide, but how good the maps are where stereo was left out:
-priors of one recording that are hardly different have differed by .006."""
-GOOD_MAPS = 3.0
-"""Then they are used if depth is so many times as far off there without them."""
+CLEAR = 0.03
+"""How far ahead in the mean either is where no further camera is needed."""
+DECIBEL = 0.02
+"""What a decibel of PSNR counts beside SSIM: in full runs both rise together so."""
+
+
+class Likeness(NamedTuple):
+    """How like its images a left-out camera is predicted: mean of the whole images and of what moves in them."""
+
+    psnr: float
+    ssim: float
+
+    @classmethod
+    def of(cls, image: Tensor, truth: Tensor, within: np.ndarray | None = None) -> Likeness:
+        """Of an image [H, W, 3], or of its pixels `within` [H, W]."""
+        return cls(min(psnr(image, truth, within), NO_DIFFERENCE), ssim_uniform(image, truth, within=within))
+
+    @classmethod
+    def mean(cls, several: Iterable[Likeness]) -> Likeness:
+        """The mean of several."""
+        return cls(*(float(np.mean(scores)) for scores in zip(*several, strict=True)))
+
+    @property
+    def value(self) -> float:
+        """Both in one number."""
+        return self.ssim + DECIBEL * self.psnr
 
 
 @dataclass(frozen=True)
 class Trials:
     """What left-out training cameras say of the prior."""
 
-    everything: Mapping[str, float]
-    """SSIM of the images of each left-out camera, where the others were trained with the whole prior."""
-    stereo: Mapping[str, float]
+    everything: Mapping[str, Likeness]
+    """Of each left-out camera, where the others were trained with the whole prior."""
+    stereo: Mapping[str, Likeness]
     """The same with stereo alone."""
-    gain: float
-    """How many times as far off depth is without maps where stereo was left out, median of the views; 0: unknown."""
     cpu_seconds: float
+    allowance: float = 0.0
+    """How much worse the whole prior may be."""
+
+    @property
+    def ahead(self) -> float:
+        """How much better the whole prior predicts left-out cameras than its stereo, in the mean, and the allowance."""
+        with_it, without = (Likeness.mean(of.values()).value for of in (self.everything, self.stereo))
+        return with_it - without + self.allowance
 
     @property
     def choice(self) -> Belief:
-        """What predicts left-out cameras better; within `TIE` the whole prior if maps are good, else stereo alone."""
-        ahead = _mean(self.everything) - _mean(self.stereo)
-        better = ahead > 0 if abs(ahead) >= TIE else self.gain >= GOOD_MAPS
-        return "all" if better else "stereo"
+        """What predicts left-out cameras better; stereo alone where both do alike."""
+        return "all" if self.ahead > 0 else "stereo"
 
     def __str__(self) -> str:
-        with_it, without = _mean(self.everything), _mean(self.stereo)
         used = {"all": "is worth inserting: the whole prior is used", "stereo": "confirms stereo, which alone is used"}
-        verdict = used[self.choice]
-        if abs(with_it - without) < TIE:
-            known = f"depth is {self.gain:.1f} times as far off without it where stereo was left out"
-            unknown = "there is too little stereo to leave some out"
-            verdict += f": trials are level, and {known if self.gain else unknown}"
-        return f"here monocular depth {verdict} (left-out cameras: SSIM {with_it:.3f} with it, {without:.3f} without)"
+        means = (Likeness.mean(of_cameras.values()) for of_cameras in (self.everything, self.stereo))
+        with_it, without = (f"{mean.psnr:.2f} dB, SSIM {mean.ssim:.3f}" for mean in means)
+        seen = f"left-out cameras, and what moves there: {with_it} with it; {without} without"
+        return f"here monocular depth {used[self.choice]} ({seen})"
 
     def as_dict(self) -> dict[str, Any]:
         """For the table beside the prior and for metrics.json."""
-        ssim = {"all": dict(self.everything), "stereo": dict(self.stereo)}
-        about = {"text": str(self), "cpu_seconds": self.cpu_seconds, "gain": self.gain}
-        return {"choice": self.choice, "ssim": ssim} | about
-
-
-def _mean(ssim: Mapping[str, float]) -> float:
-    return float(np.mean(list(ssim.values())))
+        beliefs = {"all": self.everything, "stereo": self.stereo}
+        scores = {
+            name: {belief: {camera: getattr(one, name) for camera, one in of.items()} for belief, of in beliefs.items()}
+            for name in Likeness._fields
+        }
+        return {"choice": self.choice, **scores, "text": str(self), "cpu_seconds": self.cpu_seconds}
 
 
 def can_decide(settings: RunSettings, scene: Scene) -> bool:
-    """Whether trials can say anything: nothing is chosen, two depth sources that both insert, and three cameras."""
+    """Whether trials can say anything: nothing is chosen, two depth sources that both insert, and two cameras."""
     chosen = "believe" in settings.overrides.get("d2", {})
     both = scene.plan.uses("verification") and scene.prior_settings.variant == "dual"
     return not chosen and both and len(scene.train_cameras) >= LEAST_CAMERAS
@@ -134,23 +156,26 @@ def leave_out_in_turn(settings: RunSettings, scene: Scene, points: TimedPoints, 
     """
     begin = time.process_time()
     trial = _Trial.of(settings, scene, points, store)
-    scores: dict[Belief, dict[str, float]] = {"all": {}, "stereo": {}}
+    likeness: dict[Belief, dict[str, Likeness]] = {"all": {}, "stereo": {}}
     chosen = left_out(scene.train_cameras)
-    with progress_bar("trials", len(chosen) * len(scores)) as bar:
+    allowance = ALONE if len(chosen) == LEAST_CAMERAS else 0.0
+    with progress_bar("trials", len(chosen) * len(likeness)) as bar:
         for camera in chosen:
             others = [name for name in scene.train_cameras if name != camera]
-            for belief, of_cameras in scores.items():
-                ssim = of_cameras[camera] = trial.score(trial.model(others, belief), camera)
-                bar.update(sum(map(len, scores.values())), f"without camera {camera}: SSIM {ssim:.3f}")
-            if abs(scores["all"][camera] - scores["stereo"][camera]) >= CLEAR:
+            for belief, of_cameras in likeness.items():
+                seen = of_cameras[camera] = trial.likeness(trial.model(others, belief), camera)
+                bar.update(sum(map(len, likeness.values())), f"without camera {camera}: {seen.psnr:.2f} dB")
+            trials = Trials(likeness["all"], likeness["stereo"], time.process_time() - begin, allowance)
+            if abs(trials.ahead) >= CLEAR:
                 break
-    return Trials(scores["all"], scores["stereo"], trial.gain, time.process_time() - begin)
+    return trials
 
 
 def left_out(cameras: Sequence[str]) -> tuple[str, ...]:
-    """At most `MOST_LEFT_OUT` of the cameras, evenly spread."""
+    """At most `MOST_LEFT_OUT` of the cameras, evenly spread; every second one first."""
     count = min(len(cameras), MOST_LEFT_OUT)
-    return tuple(cameras[(2 * i + 1) * len(cameras) // (2 * count)] for i in range(count))
+    spread = tuple(cameras[(2 * i + 1) * len(cameras) // (2 * count)] for i in range(count))
+    return spread[1::2] + spread[::2]
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,7 +186,6 @@ class _Trial:
     scene: Scene
     points: TimedPoints
     store: Store
-    gain: float
 
     @classmethod
     def of(cls, settings: RunSettings, scene: Scene, points: TimedPoints, store: PriorStore) -> _Trial:
@@ -178,10 +202,7 @@ class _Trial:
             downscale=settings.downscale * factor,
         )
         scene = replace(scene.with_points(points, settings), recording=recording, test_cameras=())
-        records = [store.record(camera, frame) or {} for camera in cameras for frame in frames]
-        gains = [skill["gain"] for record in records if (skill := record.get("skill")) and skill["gain"]]
-        small = SmallStore(store, factor)
-        return cls(replace(settings, iterations=STEPS), scene, points, small, median(gains or [0.0]))
+        return cls(replace(settings, iterations=STEPS), scene, points, SmallStore(store, factor))
 
     def model(self, cameras: Sequence[str], belief: Belief) -> Any:
         """A model that some of the cameras trained, begun on their stereo as a run is, in too few steps to gather the
@@ -198,15 +219,20 @@ class _Trial:
         return trainer.model
 
     @torch.no_grad()
-    def score(self, model: Any, camera: str) -> float:
-        """How well a model predicts a camera: SSIM, mean over the instants."""
-        scores = []
-        for frame in self.scene.recording.frames:
-            truth = torch.from_numpy(self.scene.recording.image(camera, frame)).float() / 255
-            view = make_view(self.scene.recording, camera, frame, self.settings.device)
+    def likeness(self, model: Any, camera: str) -> Likeness:
+        """How well a model predicts a camera, mean over the instants."""
+        recording = self.scene.recording
+        still = still_image(recording, camera, recording.frames)
+        whole, moving = [], []
+        for frame in recording.frames:
+            truth = torch.from_numpy(recording.image(camera, frame)).float() / 255
+            view = make_view(recording, camera, frame, self.settings.device)
             predicted = model.render(view).color.cpu().clamp(0, 1)
-            scores.append(ssim_uniform(predicted, truth))
-        return float(np.mean(scores))
+            whole.append(Likeness.of(predicted, truth))
+            moves = what_moves(truth.numpy(), still)
+            if moves is not None and not math.isnan((seen := Likeness.of(predicted, truth, moves)).ssim):
+                moving.append(seen)
+        return Likeness.mean([Likeness.mean(seen) for seen in (whole, moving) if seen])
 
 
 class SmallStore:
