@@ -18,8 +18,8 @@ VARIANTS: tuple[Variant, ...] = get_args(Variant)
 EPSILON = 1e-9
 """The paper's eps, world units."""
 CONFIRMS, NEAR = 2.0, 0.1
-"""A map confirms a match that no other view does within so many of its sigmas, where these are less than that: one
-that is hardly known agrees with anything."""
+"""A map finds a match that no other view does within so many of its sigmas and that relative difference. It confirms
+it where the first are less than the second: one that is hardly known agrees with anything."""
 SURER, SUREST = 0.25, 0.005
 """Sigma of such a match: this share of the map's and of how far the two are apart, and no less than that."""
 
@@ -106,19 +106,21 @@ def fuse(
 
 
 def with_matches(maps: FusedPrior, mono: np.ndarray, sigma: np.ndarray, unconfirmed: np.ndarray) -> FusedPrior:
-    """D* with the matches that the monocular map confirms where no other view does; an addition to the paper.
+    """D* with the matches that the monocular map finds where no other view does; an addition to the paper.
 
-    A match (all maps are float [H, W], depths 0 where there is none) near `mono` is verified, as the paper has it, and
-    takes the place of the map's depth, which is not as exact, or of nothing, at an edge that the map blurs. Its sigma
-    says that it had one witness: a share of the relative `sigma` of the map and of how far the two are apart.
+    A match (all maps are float [H, W], depths 0 where there is none) near `mono` takes the place of the map's depth,
+    which is not as exact, or of nothing, at an edge that the map blurs. It is verified, as the paper has it, where the
+    map confirms it, and else agreed. Its sigma says that it had one witness: a share of the relative `sigma` of the map
+    and of how far the two are apart.
     """
-    known = (mono > 0) & (unconfirmed > 0) & (CONFIRMS * sigma < NEAR)
+    known = (mono > 0) & (unconfirmed > 0) & (sigma < np.inf)
     apart = np.abs(np.log(np.where(known, unconfirmed, 1) / np.where(known, mono, 1)))
-    found = known & (apart < CONFIRMS * sigma)
+    found = known & (apart < np.fmin(CONFIRMS * sigma, NEAR))
+    labels = np.where(CONFIRMS * sigma < NEAR, np.uint8(Label.VERIFIED), np.uint8(Label.AGREED))
     return replace(
         maps,
         depth=np.where(found, unconfirmed, maps.depth),
-        labels=np.where(found, np.uint8(Label.VERIFIED), maps.labels),
+        labels=np.where(found, labels, maps.labels),
         sigma=np.where(found, np.fmax(np.float32(SURER) * (sigma + apart), np.float32(SUREST)), maps.sigma),
     )
 

@@ -189,12 +189,13 @@ class Run:
         if self.guidance is not None and attach:
             start = self.guidance.start(self.scene, triangulated, self.priors)
         elif attach:
-            config, scene = hook_config(self.settings, self.priors), self.scene
+            config, scene = hook_config(self.settings, self.priors, self.trials), self.scene
             if config.densify is not None and config.believe != "nothing":
                 prior, most = PriorStore.open(self.priors).prior, FROM_STEREO
                 if (limit := config.densify.max_gaussians) is not None:
                     most = min(most, max(limit - len(start), 0))
-                start = with_stereo(start, scene.recording, scene.train_cameras, prior, self.settings.seed, most)
+                chosen, seed = config.believe or "all", self.settings.seed
+                start = with_stereo(start, scene.recording, scene.train_cameras, prior, chosen, seed, most)
         hooks = self._attach if attach and self.uses_prior else None
         return self.scene.trainer(self.settings, triangulated, start, hooks, appearance=attach)
 

@@ -16,10 +16,11 @@ from torch import Tensor
 
 from d2_plugin.durable import opened_archive, write_archive
 from d2_plugin.errors import D2Error, MissingExtra
+from d2_plugin.hooks.prior import Belief, believed
 from d2_plugin.priors.colmap.points import triangulate_frames
 from d2_plugin.priors.geometry import projected
 from d2_plugin.priors.stereo.depth_range import FEWEST
-from d2_plugin.protocol import DepthPrior, Label, View
+from d2_plugin.protocol import DepthPrior, View
 from d2_plugin.reading import parsing
 from d2_plugin.recordings import Recording
 from d2_plugin.recordings.cameras.camera import focus_of
@@ -256,15 +257,17 @@ def with_stereo(
     recording: Recording,
     cameras: Sequence[str],
     prior: Callable[[str, int], DepthPrior | None],
+    belief: Belief = "all",
     seed: int = 0,
     most: int = FROM_STEREO,
 ) -> TimedPoints:
-    """The points, and up to `most` verified pixels of the priors, as many of each view at five instants."""
+    """The points, and up to `most` trusted pixels of what is believed of the priors, as many of each view at five
+    instants."""
     views, rng = list(itertools.product(spread(recording.frames, 5), cameras)), np.random.default_rng(seed)
     parts = [points]
     for frame, camera in views:
         if (known := prior(camera, frame)) is not None:
-            pixels = np.argwhere((known.labels == Label.VERIFIED).numpy())
+            pixels = np.argwhere(believed(known, belief).trusted.numpy())
             rows, columns = rng.permutation(pixels)[: most // len(views)].T
             parts.append(_back_projected(recording, camera, frame, rows, columns, known.depth.numpy()[rows, columns]))
     return TimedPoints.joined(parts)

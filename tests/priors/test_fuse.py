@@ -111,10 +111,12 @@ def test_a_match_that_no_view_confirms_counts_where_the_map_does_as_far_as_the_m
     fused = fuse(mono, geometric, tau_c=0.1, hanging=hanging, **uncertain)
     found = with_matches(fused, mono, sigma, unconfirmed)
     taken = np.flatnonzero((found.depth != fused.depth)[0])
-    assert taken.tolist() == [0, 7]
+    assert taken.tolist() == [0, 7], "where the map hardly knows, it and the match are one here"
     np.testing.assert_array_equal(found.depth[0, taken], unconfirmed[0, taken])
     np.testing.assert_array_equal(found.labels == Label.VERIFIED, [[True, *[False] * 5, True, True]])
-    assert (found.labels[0, [1, 2, 4, 5]] == Label.MONO).all()
+    assert (found.labels[0, [1, 2, 4]] == Label.MONO).all()
+    assert found.labels[0, 5] == Label.AGREED, "no stereo to rely on where the network is of no use"
+    assert found.sigma[0, 5] < sigma[0, 5]
     assert (found.sigma[0, taken] > uncertain["sigma_geometric"][0, 6]).all()
     assert (found.sigma[0, taken] < sigma[0, taken]).all()
     for unit in (1e-30, 1e30):

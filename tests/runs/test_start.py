@@ -141,3 +141,15 @@ def test_a_run_that_inserts_starts_on_what_stereo_verified(recording) -> None:
         assert set(start.times[mine]) == {recording.seconds(frame)}
         assert columns.max() == 59
         assert len({*zip(rows, columns)}) == share
+
+
+@pytest.mark.parametrize(("belief", "reach"), [("all", 80), ("stereo", 60), ("nothing", 0)])
+def test_a_run_starts_on_what_is_believed(recording, belief, reach) -> None:
+    """What two sources agree on where the prior is believed; not where trials found that the network is of no use."""
+    labels = torch.full((54, 96), int(Label.MONO), dtype=torch.uint8)
+    labels[:, :60], labels[:, 60:80] = Label.VERIFIED, Label.AGREED
+    depth = torch.from_numpy(recording.depth(CAMERAS[0], 0))
+    none = TimedPoints(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
+    start = with_stereo(none, recording, CAMERAS[:1], lambda *_: DepthPrior(depth, labels), belief)
+    pixels = projected(recording.cameras[CAMERAS[0]], start.positions)[0]
+    assert (int(np.floor(pixels[:, 0].max())) + 1 if len(start) else 0) == reach

@@ -88,13 +88,13 @@ def test_what_stands_at_a_wrong_place_counts_where_ssim_forgives_it() -> None:
     assert Trials({"a": wrong}, {"a": GOOD}, 1.0).choice == "stereo"
 
 
-@pytest.mark.parametrize(("ahead", "asked"), [(0.012, 6), (0.018, 4), (0.04, 2)])
+@pytest.mark.parametrize(("ahead", "asked"), [(0.012, 6), (0.018, 4), (0.04, 4)])
 def test_cameras_are_left_out_until_it_is_clear(ahead, asked, monkeypatch) -> None:
-    """The mean of those so far, with the second one twice as much: .012 .018 .015 of three, .018 and .027, .04."""
+    """The mean of two is 1.75 times the first, .021, .032 or .07; one alone is never clear."""
     scores = iter([GOOD.ssim + ahead, GOOD.ssim, GOOD.ssim + 2.5 * ahead, GOOD.ssim, GOOD.ssim, GOOD.ssim])
     made: list[object] = []
     seen = lambda *_: Likeness(GOOD.psnr, next(scores))  # noqa: E731
-    trial = SimpleNamespace(model=lambda *_: made.append(0), likeness=seen)
+    trial = SimpleNamespace(model=lambda *_, **__: made.append(0), likeness=seen)
     monkeypatch.setattr("d2_plugin.runs.prior.trials._Trial.of", lambda *_: trial)
     trials = leave_out_in_turn(None, SimpleNamespace(train_cameras=TRAINED), NO_POINTS, None)
     assert len(made) == asked
@@ -107,9 +107,9 @@ def test_cameras_are_left_out_until_it_is_clear(ahead, asked, monkeypatch) -> No
 def test_either_of_two_cameras_trains_alone_and_so_the_prior_may_predict_the_other_worse(
     cameras, behind, choice, monkeypatch
 ) -> None:
-    """*studio* with good maps, and with PyDNet's: 1.2 dB better with them, 2.6 without, after 2000 steps."""
+    """*studio*, by an earlier prior: 1.2 dB better with good maps after 2000 steps, .8 dB better without PyDNet's."""
     likeness = cycle([Likeness(GOOD.psnr, GOOD.ssim - behind), GOOD])
-    trial = SimpleNamespace(model=lambda *_: None, likeness=lambda *_: next(likeness))
+    trial = SimpleNamespace(model=lambda *_, **__: None, likeness=lambda *_: next(likeness))
     monkeypatch.setattr("d2_plugin.runs.prior.trials._Trial.of", lambda *_: trial)
     trials = leave_out_in_turn(None, SimpleNamespace(train_cameras=TRAINED[:cameras]), NO_POINTS, None)
     assert trials.choice == choice
@@ -150,7 +150,9 @@ def test_what_moves_counts_as_much_as_the_whole_image(saved_room: Callable[..., 
     assert seen.ssim < 0.75, "the whole image alone is nearly right"
 
 
-@pytest.mark.parametrize(("cameras", "chosen"), [("ab", "ba"), ("abc", "bac"), ("abcd", "bdac"), ("abcdefgh", "dhbf")])
+@pytest.mark.parametrize(
+    ("cameras", "chosen"), [("ab", "baba"), ("abc", "bac"), ("abcd", "bdac"), ("abcdefgh", "dhbf")]
+)
 def test_however_many_cameras_there_are_at_most_four_are_left_out_those_apart_first(cameras, chosen) -> None:
     assert left_out(tuple(cameras)) == tuple(chosen)
 
@@ -188,8 +190,8 @@ def test_depth_is_believed_if_it_is_right_whatever_its_sigma(room, tmp_path, wro
 def test_a_trial_begins_on_stereo_of_the_cameras_that_train_it_and_of_no_other(room, tmp_path, monkeypatch) -> None:
     begun = []
 
-    def recorded(points: TimedPoints, recording: Recording, cameras: list[str], prior: object) -> TimedPoints:
-        begun.append((cameras, len(start := with_stereo(points, recording, cameras, prior))))
+    def recorded(points: TimedPoints, recording: Recording, cameras: list[str], *rest: object) -> TimedPoints:
+        begun.append((cameras, len(start := with_stereo(points, recording, cameras, *rest))))
         return start
 
     monkeypatch.setattr("d2_plugin.runs.prior.trials.with_stereo", recorded)

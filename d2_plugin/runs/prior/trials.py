@@ -14,6 +14,7 @@ for both beliefs alike.
 from __future__ import annotations
 
 import contextlib
+import itertools
 import math
 import time
 from collections.abc import Iterable, Mapping, Sequence
@@ -43,7 +44,7 @@ from d2_plugin.store.store import TRIALS, PriorStore
 LEAST_ITERATIONS = 300
 """Of a run that makes trials; a shorter one would take less time than they, and only knows what was tried before."""
 LEAST_CAMERAS = 2
-ALONE = 0.02
+ALONE = 0.01
 """How much worse the whole prior may predict either of two cameras from the other: one alone trains worse with it than
 two do."""
 STEPS = 200
@@ -55,7 +56,7 @@ INSTANTS = 4
 MOST_LEFT_OUT = 4
 """Cameras that are left out, spread evenly in the order in which they are named."""
 CLEAR = 0.03
-"""How far ahead in the mean either is where no further camera is needed."""
+"""How far ahead in the mean of two cameras or more either is where no further one is needed."""
 DECIBEL = 0.02
 """What a decibel of PSNR counts beside SSIM: in full runs both rise together so."""
 
@@ -107,7 +108,7 @@ class Trials:
 
     def __str__(self) -> str:
         used = {"all": "is worth inserting: the whole prior is used", "stereo": "confirms stereo, which alone is used"}
-        means = (Likeness.mean(of_cameras.values()) for of_cameras in (self.everything, self.stereo))
+        means = (Likeness.mean(of.values()) for of in (self.everything, self.stereo))
         with_it, without = (f"{mean.psnr:.2f} dB, SSIM {mean.ssim:.3f}" for mean in means)
         seen = f"left-out cameras, and what moves there: {with_it} with it; {without} without"
         return f"here monocular depth {used[self.choice]} ({seen})"
@@ -156,26 +157,32 @@ def leave_out_in_turn(settings: RunSettings, scene: Scene, points: TimedPoints, 
     """
     begin = time.process_time()
     trial = _Trial.of(settings, scene, points, store)
-    likeness: dict[Belief, dict[str, Likeness]] = {"all": {}, "stereo": {}}
-    chosen = left_out(scene.train_cameras)
-    allowance = ALONE if len(chosen) == LEAST_CAMERAS else 0.0
-    with progress_bar("trials", len(chosen) * len(likeness)) as bar:
-        for camera in chosen:
+    beliefs: tuple[Belief, Belief] = ("all", "stereo")
+    seen: dict[Belief, dict[str, list[Likeness]]] = {belief: {} for belief in beliefs}
+    chosen, pair = left_out(scene.train_cameras), len(scene.train_cameras) == LEAST_CAMERAS
+    with progress_bar("trials", len(chosen) * len(beliefs)) as bar:
+        for number, (camera, belief) in enumerate(itertools.product(chosen, beliefs), start=1):
             others = [name for name in scene.train_cameras if name != camera]
-            for belief, of_cameras in likeness.items():
-                seen = of_cameras[camera] = trial.likeness(trial.model(others, belief), camera)
-                bar.update(sum(map(len, likeness.values())), f"without camera {camera}: {seen.psnr:.2f} dB")
-            trials = Trials(likeness["all"], likeness["stereo"], time.process_time() - begin, allowance)
-            if abs(trials.ahead) >= CLEAR:
-                break
+            earlier = seen[belief].setdefault(camera, [])
+            earlier.append(trial.likeness(trial.model(others, belief, seed=len(earlier)), camera))
+            bar.update(number, f"without camera {camera}: {earlier[-1].psnr:.2f} dB")
+            if belief == beliefs[-1]:
+                everything, stereo = (_means(seen[which]) for which in beliefs)
+                trials = Trials(everything, stereo, time.process_time() - begin, ALONE if pair else 0.0)
+                if len(everything) > 1 and abs(trials.ahead) >= CLEAR:
+                    break
     return trials
 
 
+def _means(seen: Mapping[str, Sequence[Likeness]]) -> dict[str, Likeness]:
+    return {camera: Likeness.mean(several) for camera, several in seen.items()}
+
+
 def left_out(cameras: Sequence[str]) -> tuple[str, ...]:
-    """At most `MOST_LEFT_OUT` of the cameras, evenly spread; every second one first."""
+    """At most `MOST_LEFT_OUT` of the cameras, evenly spread, every second one first; each of two cameras twice."""
     count = min(len(cameras), MOST_LEFT_OUT)
     spread = tuple(cameras[(2 * i + 1) * len(cameras) // (2 * count)] for i in range(count))
-    return spread[1::2] + spread[::2]
+    return (spread[1::2] + spread[::2]) * (2 if count == LEAST_CAMERAS else 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,17 +211,16 @@ class _Trial:
         scene = replace(scene.with_points(points, settings), recording=recording, test_cameras=())
         return cls(replace(settings, iterations=STEPS), scene, points, SmallStore(store, factor))
 
-    def model(self, cameras: Sequence[str], belief: Belief) -> Any:
+    def model(self, cameras: Sequence[str], belief: Belief, seed: int) -> Any:
         """A model that some of the cameras trained, begun on their stereo as a run is, in too few steps to gather the
         evidence that pruning takes."""
-        config: Any = hook_config(self.settings, Path())
+        settings = replace(self.settings, seed=seed)
+        config: Any = hook_config(settings, Path())
         config = replace(config, believe=belief, prune=None, parallax=None)
-        adapter: Any = registry.load(registry.ADAPTERS, self.settings.backbone)
+        adapter: Any = registry.load(registry.ADAPTERS, settings.backbone)
         scene = replace(self.scene, train_cameras=tuple(cameras))
-        start = with_stereo(self.points, scene.recording, cameras, self.store.prior)
-        trainer = scene.trainer(
-            self.settings, self.points, start, lambda model: D2Hooks(config, adapter(model), self.store)
-        )
+        start = with_stereo(self.points, scene.recording, cameras, self.store.prior, belief, seed)
+        trainer = scene.trainer(settings, self.points, start, lambda model: D2Hooks(config, adapter(model), self.store))
         trainer.run()
         return trainer.model
 
