@@ -55,8 +55,8 @@ INSTANTS = 4
 """Of the recording in a trial, evenly spread."""
 MOST_LEFT_OUT = 4
 """Cameras that are left out, spread evenly in the order in which they are named."""
-CLEAR = 0.03
-"""How far ahead in the mean of two cameras or more either is where no further one is needed."""
+CLEAR = 0.015
+"""How far ahead in the mean either belief is where no further camera is needed, if the two or more so far agree."""
 DECIBEL = 0.02
 """What a decibel of PSNR counts beside SSIM: in full runs both rise together so."""
 
@@ -96,15 +96,20 @@ class Trials:
     """How much worse the whole prior may be."""
 
     @property
-    def ahead(self) -> float:
-        """How much better the whole prior predicts left-out cameras than its stereo, in the mean, and the allowance."""
-        with_it, without = (Likeness.mean(of.values()).value for of in (self.everything, self.stereo))
-        return with_it - without + self.allowance
+    def ahead(self) -> Sequence[float]:
+        """How much better the whole prior predicts each left-out camera than its stereo, and the allowance."""
+        return [seen.value - self.stereo[camera].value + self.allowance for camera, seen in self.everything.items()]
+
+    @property
+    def clear(self) -> bool:
+        """Whether no further camera is needed: two at least agree, and their mean is far from nothing."""
+        agree = min(self.ahead) > 0 or max(self.ahead) < 0
+        return len(self.ahead) > 1 and agree and abs(float(np.mean(self.ahead))) >= CLEAR
 
     @property
     def choice(self) -> Belief:
         """What predicts left-out cameras better; stereo alone where both do alike."""
-        return "all" if self.ahead > 0 else "stereo"
+        return "all" if np.mean(self.ahead) > 0 else "stereo"
 
     def __str__(self) -> str:
         used = {"all": "is worth inserting: the whole prior is used", "stereo": "confirms stereo, which alone is used"}
@@ -169,7 +174,7 @@ def leave_out_in_turn(settings: RunSettings, scene: Scene, points: TimedPoints, 
             if belief == beliefs[-1]:
                 everything, stereo = (_means(seen[which]) for which in beliefs)
                 trials = Trials(everything, stereo, time.process_time() - begin, ALONE if pair else 0.0)
-                if len(everything) > 1 and abs(trials.ahead) >= CLEAR:
+                if trials.clear:
                     break
     return trials
 
