@@ -91,7 +91,7 @@ def assembled(
     bent = {name: camera for name, camera in cameras.items() if camera.lens.bends}
     if bent:
         source = UndistortedSource(source, bent)
-    all_notes = (*notes, *mask_notes, *_lens_notes(bent))
+    all_notes = (*notes, *mask_notes, *_mono_notes(path / "mono", monos), *_lens_notes(bent))
     for note in all_notes:
         log.info("%s: %s", path.name, note)
     return Recording(
@@ -133,6 +133,13 @@ def _mono_description(path: Path) -> tuple[MonoKind, bool]:
     content = read_json(declared, CORRECT) if declared.exists() else {}
     kind: MonoKind = field(content, "kind", MonoKind, str(declared), CORRECT, default="relative")
     return kind, field(content, "emulated", bool, str(declared), CORRECT, default=False)
+
+
+def _mono_notes(folder: Path, monos: Mapping[str, FrameFiles]) -> tuple[str, ...]:
+    """A word about maps that are no arrays, or lie elsewhere: a run without them looks like one that used them."""
+    if any(monos.values()) or not folder.is_dir() or all(entry.name == "mono.json" for entry in folder.iterdir()):
+        return ()
+    return ("nothing in mono/ is used: a map is an array of numbers [height, width] in mono/CAMERA/FRAME.npy",)
 
 
 def _map(path: Path, key: str | None) -> np.ndarray:

@@ -134,7 +134,7 @@ class TestMistakes:
             (
                 Work,
                 ["--names", "a", "--names", "b"],
-                "--names is given twice: join its values by commas, as --names a,b",
+                "--names is given twice: join its values by commas",
             ),
             (Work, ["--frames", "0-8"], "--frames is '0-8': give whole numbers joined by commas, or first:last"),
             (Work, ["--frames", "0:8:0"], "--frames is '0:8:0'"),

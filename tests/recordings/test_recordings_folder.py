@@ -78,6 +78,20 @@ def test_maps_are_declared_in_mono_json_and_optional(folder: Path) -> None:
     assert recording.mono("train0", 0) is None
 
 
+def test_maps_that_are_no_arrays_are_not_silently_left_out(folder: Path) -> None:
+    assert not any("mono/" in note for note in open_recording(folder).notes)
+    for array in sorted((folder / "mono").glob("*/*.npy")):
+        array.rename(array.with_suffix(".png"))
+    recording = open_recording(folder)
+    assert recording.mono_kind is None
+    assert (
+        "nothing in mono/ is used: a map is an array of numbers [height, width] in mono/CAMERA/FRAME.npy"
+        in recording.notes
+    )
+    shutil.rmtree(folder / "mono")
+    assert not any("mono/" in note for note in open_recording(folder).notes)
+
+
 def test_depth_that_is_not_finite_counts_as_unknown_and_monocular_maps_keep_their_holes(folder, original) -> None:
     depth = original.depth("train0", 0).copy()
     depth[0, :3] = np.nan, np.inf, -1
