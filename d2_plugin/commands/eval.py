@@ -19,6 +19,8 @@ class Evaluation(Settings):
 
     run_folder: Annotated[Path, Positional()]
     """The --output of `d2 train`."""
+    recording: Path | None = None
+    """Where its recording lies now, if that was moved; the run remembers it."""
     no_images: bool = False
     """Scores only."""
 
@@ -28,5 +30,5 @@ def run(settings: Evaluation) -> str:
     from d2_plugin.runs.run import Run
     from d2_plugin.runs.tables import metrics_table
 
-    metrics = Run.load(settings.run_folder).evaluate(images=not settings.no_images)
+    metrics = Run.load(settings.run_folder, settings.recording).evaluate(images=not settings.no_images)
     return metrics_table({settings.run_folder.resolve().name: metrics})

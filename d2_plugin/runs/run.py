@@ -77,12 +77,21 @@ class Run:
 
     @classmethod
     @checked_arguments
-    def load(cls, folder: Path) -> Run:
-        """The run that lies in `folder`."""
+    def load(cls, folder: Path, recording: Path | None = None) -> Run:
+        """The run that lies in `folder`; `recording` is where its recording lies now, if it was moved, and is kept."""
         table = saved.read_run(folder)
         if "guidance" in table:
             raise D2Error(f"{folder} is a run of {table['guidance']}: continue it with the command that began it")
-        return cls(RunSettings.from_table(table, str(folder / "run.json")), folder)
+        settings = RunSettings.from_table(table, str(folder / "run.json"))
+        if recording is not None:
+            settings = check(replace(settings, recording=str(recording)))
+            Scene.open(settings)  # what cannot be is refused before anything is written
+            with only_writer(folder):
+                write_table(folder / "run.json", settings.as_table(), saved.RUN)
+        elif not Path(settings.recording).exists():
+            remedy = f"if it was moved, `d2 eval {folder} --recording PATH` says where to"
+            raise D2Error(f"{settings.recording}, the recording of {folder}, is not there: {remedy}")
+        return cls(settings, folder)
 
     @property
     def uses_prior(self) -> bool:

@@ -74,6 +74,24 @@ def test_evaluating_again_gives_the_same_scores(finished: Path) -> None:
     assert (after["test"], after["per_view"]) == (before["test"], before["per_view"])
 
 
+def test_a_run_finds_its_recording_where_that_was_moved(finished, recording, tmp_path, answered, refused) -> None:
+    run, place = shutil.copytree(finished, tmp_path / "full"), shutil.copytree(recording, tmp_path / "here")
+    scores = json.loads((finished / "metrics.json").read_text())["per_view"]
+
+    def evaluated(*more: str) -> object:
+        answered("eval", str(run), "--no-images", *more)
+        return json.loads((run / "metrics.json").read_text())["per_view"]
+
+    assert evaluated("--recording", str(place)) == scores
+    moved = place.rename(tmp_path / "there")
+    remedy = f"if it was moved, `d2 eval {run} --recording PATH` says where to"
+    assert f"{place}, the recording of {run}, is not there: {remedy}" in refused("eval", str(run))
+    refused("eval", str(run), "--recording", str(tmp_path))
+    assert remedy in refused("render", str(run)), "what is no recording was not kept"
+    assert evaluated("--recording", str(moved)) == scores
+    assert evaluated() == scores
+
+
 def test_a_run_in_the_current_folder_has_its_name(finished: Path, tmp_path, answered, monkeypatch) -> None:
     monkeypatch.chdir(shutil.copytree(finished, tmp_path / "full"))
     assert "\n| full | " in answered("eval", ".", "--no-images")
