@@ -14,7 +14,6 @@ for both beliefs alike.
 from __future__ import annotations
 
 import contextlib
-import itertools
 import math
 import time
 from collections.abc import Iterable, Mapping, Sequence
@@ -162,20 +161,20 @@ def leave_out_in_turn(settings: RunSettings, scene: Scene, points: TimedPoints, 
     """
     begin = time.process_time()
     trial = _Trial.of(settings, scene, points, store)
-    beliefs: tuple[Belief, Belief] = ("all", "stereo")
-    seen: dict[Belief, dict[str, list[Likeness]]] = {belief: {} for belief in beliefs}
-    chosen, pair = left_out(scene.train_cameras), len(scene.train_cameras) == LEAST_CAMERAS
-    with progress_bar("trials", len(chosen) * len(beliefs)) as bar:
-        for number, (camera, belief) in enumerate(itertools.product(chosen, beliefs), start=1):
+    seen: dict[Belief, dict[str, list[Likeness]]] = {"all": {}, "stereo": {}}
+    chosen, done = left_out(scene.train_cameras), 0
+    allowance = ALONE if len(scene.train_cameras) == LEAST_CAMERAS else 0.0
+    with progress_bar("trials", len(chosen) * len(seen)) as bar:
+        for camera in chosen:
             others = [name for name in scene.train_cameras if name != camera]
-            earlier = seen[belief].setdefault(camera, [])
-            earlier.append(trial.likeness(trial.model(others, belief, seed=len(earlier)), camera))
-            bar.update(number, f"without camera {camera}: {earlier[-1].psnr:.2f} dB")
-            if belief == beliefs[-1]:
-                everything, stereo = (_means(seen[which]) for which in beliefs)
-                trials = Trials(everything, stereo, time.process_time() - begin, ALONE if pair else 0.0)
-                if trials.clear:
-                    break
+            for belief, of_cameras in seen.items():
+                earlier = of_cameras.setdefault(camera, [])
+                earlier.append(trial.likeness(trial.model(others, belief, seed=len(earlier)), camera))
+                bar.update(done := done + 1, f"without camera {camera}: {earlier[-1].psnr:.2f} dB")
+            everything, stereo = _means(seen["all"]), _means(seen["stereo"])
+            trials = Trials(everything, stereo, time.process_time() - begin, allowance)
+            if trials.clear:
+                break
     return trials
 
 
