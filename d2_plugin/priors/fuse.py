@@ -19,7 +19,7 @@ EPSILON = 1e-9
 """The paper's eps, world units."""
 CONFIRMS, NEAR = 2.0, 0.1
 """A map finds a match that no other view does within so many of its sigmas and that relative difference. It confirms
-it where the first are less than the second: one that is hardly known agrees with anything."""
+it where its sigma is less than the second: one that is hardly known agrees with anything."""
 SURER, SUREST = 0.25, 0.005
 """Sigma of such a match: this share of the map's and of how far the two are apart, and no less than that."""
 
@@ -116,7 +116,7 @@ def with_matches(maps: FusedPrior, mono: np.ndarray, sigma: np.ndarray, unconfir
     known = (mono > 0) & (unconfirmed > 0) & (sigma < np.inf)
     apart = np.abs(np.log(np.where(known, unconfirmed, 1) / np.where(known, mono, 1)))
     found = known & (apart < np.fmin(CONFIRMS * sigma, NEAR))
-    labels = np.where(CONFIRMS * sigma < NEAR, np.uint8(Label.VERIFIED), np.uint8(Label.AGREED))
+    labels = np.where(sigma < NEAR, np.uint8(Label.VERIFIED), np.uint8(Label.AGREED))
     return replace(
         maps,
         depth=np.where(found, unconfirmed, maps.depth),

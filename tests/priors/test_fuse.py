@@ -103,7 +103,7 @@ def test_the_blur_of_a_depth_edge_proposes_nothing_but_still_verifies() -> None:
 def test_a_match_that_no_view_confirms_counts_where_the_map_does_as_far_as_the_map_knows() -> None:
     # Near, 5 sigma off, no match, no map, a map that knows nothing, one that hardly knows, stereo, near where it hangs.
     mono = np.float32([[2.0, 2.0, 2.0, 0.0, 2.0, 2.0, 2.0, 2.0]])
-    sigma = np.float32([[0.04, 0.04, 0.04, np.inf, np.inf, 0.06, 0.04, 0.04]])
+    sigma = np.float32([[0.04, 0.04, 0.04, np.inf, np.inf, 0.12, 0.04, 0.04]])
     unconfirmed = np.float32([[2.1, 2.5, 0.0, 2.1, 2.0, 2.0, 0.0, 1.9]])
     geometric = np.float32([[0, 0, 0, 0, 0, 0, 2.02, 0]])
     hanging = np.arange(8)[None] == 7

@@ -340,14 +340,18 @@ RECORDINGS = [
     ("dome", ("03", "07", "12", "15"), (10, 20, 30), NETWORK, "stereo"),
     ("studio", ("00", "02", "05", "07"), (5, 10, 15), None, "all"),
     ("plaza", ("00", "02", "05", "07"), (6, 12, 18), None, "all"),
+    ("dome", ("03", "12", "18"), (10, 20, 30), NETWORK, "stereo"),
+    ("studio", ("02", "05"), (5, 10, 15), NETWORK, "stereo"),
+    ("studio", ("02", "05"), (5, 10, 15), None, "all"),
 ]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "cameras", "frames", "network", "choice"), RECORDINGS, ids=[r[0] for r in RECORDINGS])
+@pytest.mark.parametrize(("name", "cameras", "frames", "network", "choice"), RECORDINGS)
 def test_the_choice_is_that_of_full_runs(shared_data, tmp_path, name, cameras, frames, network, choice) -> None:
-    """Held-out cameras after 2000 steps: on dome stereo alone is 1.2 dB above the whole prior; on studio and plaza
-    the whole prior is 3.1 and 5.3 dB above stereo alone."""
+    """Held-out cameras after 1000 or 2000 steps: stereo alone is above the whole prior by 1.8 dB on *dome*, by 1.9 of
+    what moves on 03 12 18 and by .8 on two views of *studio* with PyDNet; with good maps it is below by .6 on *studio*,
+    1.2 on its two views and more on *plaza*."""
     mono = {} if network is None else {"mono_onnx": str(shared_data("weights") / network), "mono_kind": "relative"}
     settings = RunSettings(str(shared_data(name)), cameras, frames=frames, **mono)
     run = Run(settings, tmp_path / "run")
