@@ -141,7 +141,7 @@ def contents(folder: Path) -> dict[str, Any]:
 def _content(path: Path) -> Any:
     if path.is_symlink():
         return f"link to {os.readlink(path)}"
-    if path.name == "metrics.json":
+    if path.name in ("metrics.json", "trials.json"):
         table = json.loads(path.read_text())
         return {name: value for name, value in table.items() if name not in ("seconds", "cpu_seconds", "made", "seal")}
     if path.name == "checkpoint.pt":

@@ -131,11 +131,6 @@ class TestMistakes:
             (Work, ["--steps"], "--steps needs a value"),
             (Work, ["--steps", "--no-images"], "--steps needs a value"),
             (Work, ["--steps", "ten"], "setting --steps must be a whole number, got 'ten'"),
-            (
-                Work,
-                ["--names", "a", "--names", "b"],
-                "--names is given twice: join its values by commas",
-            ),
             (Work, ["--frames", "0-8"], "--frames is '0-8': give whole numbers joined by commas, or first:last"),
             (Work, ["--frames", "0:8:0"], "--frames is '0:8:0'"),
             (Work, ["--frames", ""], "--frames is '': give whole numbers"),

@@ -126,9 +126,6 @@ class Form:
                 text = next(left, "--none")
                 if _is_flag(text):
                     raise D2Error(f"{flag} needs a value: `{self.command} --help` says which")
-            if setting.name in given and item_kind(setting.kind) is not None:
-                before = given[setting.name][1]
-                raise D2Error(f"{flag} is given twice: join its values by commas, as {flag} {before},{text}")
             given[setting.name] = setting, text
         return places, given
 
