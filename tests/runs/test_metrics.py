@@ -212,3 +212,17 @@ def test_files_that_are_no_weights_are_refused(tmp_path: Path) -> None:
     (tmp_path / "alex.pth").write_bytes(b"nothing")
     refuses(r"cannot read LPIPS weights .*alex\.pth", find_lpips, "alex", tmp_path)
     refuses("unknown LPIPS network 'squeeze'", find_lpips, "squeeze", tmp_path)
+
+
+def test_ssim_within_some_pixels_is_the_mean_of_their_windows() -> None:
+    """Over 32 rows, so that strips meet; of two halves of the pixels it adds up to the whole image."""
+    generator = torch.Generator().manual_seed(0)
+    image, truth = (torch.rand(50, 21, 3, generator=generator) for _ in range(2))
+    half = np.random.default_rng(0).random((50, 21)) < 0.3
+    inside = np.zeros_like(half)
+    inside[3:-3, 3:-3] = True
+    parts = [(metrics.ssim_uniform(image, truth, within=part), (part & inside).sum()) for part in (half, ~half)]
+    whole = metrics.ssim_uniform(image, truth)
+    assert sum(score * count for score, count in parts) / inside.sum() == pytest.approx(whole, abs=1e-12)
+    assert metrics.ssim_uniform(image, truth, within=inside) == pytest.approx(whole, abs=1e-12)
+    assert math.isnan(metrics.ssim_uniform(image, truth, within=~inside))
