@@ -28,7 +28,7 @@ class Label(IntEnum):
     MONO = 1  # aligned monocular depth only: may propose a Gaussian, never judge one
     VERIFIED = 2  # geometric depth confirmed by aligned monocular depth (Omega^v)
     CONFLICT = 3  # the two sources disagree: discarded
-    AGREED = 4  # no geometric depth of its own, but another camera's depth agrees: an addition to the paper
+    AGREED = 4  # another camera's depth agrees, or a match that only a weak map finds: an addition to the paper
     FAR = 5  # sky and all beyond parallax, depth is only a lower bound: an addition to the paper
 
 
