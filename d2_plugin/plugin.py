@@ -283,7 +283,11 @@ class D2Hooks:
         now = schedule_step(self.backbone, step)
         if ends and now == schedule_step(self.backbone, step - 1):
             return []  # it was due at an earlier step of this pace
-        return [(name, hook) for name, hook in self.hooks.items() if name not in self.retired and hook.config.due(now)]
+        return [
+            (name, hook)
+            for name, hook in self.hooks.items()
+            if (hook.config.due_when_retired if name in self.retired else hook.config.due)(now)
+        ]
 
     def _context(self, step: int, views: Sequence) -> Context:
         def sample() -> Sequence:
@@ -296,7 +300,7 @@ class D2Hooks:
         return Context(now, self.backbone, views, self.prior, self.generator, *seen)
 
     def _retire_if_idle(self, step: int, name: str, edit: Edit | None, context: Context) -> None:
-        if name not in HOOKS or not HOOKS[name].edits_structure or not context.evaluation:
+        if name not in HOOKS or not HOOKS[name].edits_structure or name in self.retired or not context.evaluation:
             return
         changes, settling = 0 if edit is None else edit.changes, self.hooks[name].settling
         if self._idle.retires(name, step, changes, len(self.backbone), settling):

@@ -47,6 +47,10 @@ class HookConfig(Settings):
         """Whether the hook runs at `step` (1-based, as trainers count): from start to before stop, every so many."""
         return self.start <= step and (self.stop is None or step < self.stop) and (step - self.start) % self.every == 0
 
+    def due_when_retired(self, step: int) -> bool:
+        """Whether it is due at `step` even if its evaluations had nothing to change any more."""
+        return False
+
     def left(self, step: int) -> float:
         """How often it is due from `step` on, if it is then; infinite where it runs to the end, 0 after it."""
         return math.inf if self.stop is None else max(0, -(-(self.stop - step) // self.every))

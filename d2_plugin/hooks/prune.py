@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, NamedTuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from d2_plugin.hooks.densify import EPSILON
 from d2_plugin.hooks.hook import Context, Hook, HookConfig, Surveyed
-from d2_plugin.protocol import Edit, View
+from d2_plugin.hooks.prior import camera_centre
+from d2_plugin.protocol import Backbone, Edit, View
 from d2_plugin.settings import Every, Range, Share, Steps
 
 FLOATS = 0.4
@@ -26,6 +28,14 @@ FAINT = 0.05
 RIM = 0.1
 """In the last evaluation a Gaussian's centre must lie in an image by this share of its size: of one whose fringe alone
 is seen most is not, and a held-out camera sees it whole."""
+
+
+LEAST_CAMERAS = 3
+"""Of two, each sees much of what there is alone."""
+
+PARALLEL = 1e-4
+"""Optical axes meet nowhere where the least eigenvalue of the sum of what projects across them is smaller than this, of
+each."""
 
 
 @dataclass(frozen=True)
@@ -56,6 +66,10 @@ class PruneConfig(HookConfig):
     sight: bool = True
     """Whether Gaussians go whose centre no camera sees; the paper has no such term. Images train their rim alone: they
     may grow into what held-out cameras see, and nothing tells."""
+    alone: Steps | None = None
+    """Step at which Gaussians go whose centre one camera alone sees, in front of where another one could stand
+    (`before_cameras`); none: they stay. Nothing says how far from that one they are, and to another they may hide all.
+    The paper has no such term. Last in a run: training would put others in their place."""
     light: Share = 0.05
     """Largest share of the light in the surveyed views that one evaluation takes away: the faintest go first, the rest
     waits with its evidence for the next. 1 sets no limit, as the paper. What a random start has in front of every
@@ -63,10 +77,20 @@ class PruneConfig(HookConfig):
 
     @classmethod
     def for_iterations(cls, iterations: int) -> PruneConfig:
-        """Pruning from a fifth to two thirds of the run, then of what floats up to the last twentieth. Runs of less
-        than about 250 iterations are too short to gather evidence in: there only what no camera sees goes."""
+        """Pruning from a fifth to two thirds of the run, then of what floats up to the last twentieth, and shortly
+        before the end, as trainers save before their last step ends, of what one camera alone sees. Runs of less than
+        about 250 iterations are too short to gather evidence in: there what floats stays."""
         every, score_stop, stop = max(40, min(100, iterations // 20)), 2 * iterations // 3, 19 * iterations // 20
-        return cls(start=iterations // 5, stop=stop, score_stop=score_stop, every=every)
+        alone = max(1, iterations - 1 - iterations // 200)
+        return cls(start=iterations // 5, stop=stop, score_stop=score_stop, every=every, alone=alone)
+
+    def due(self, step: int) -> bool:
+        """See `HookConfig.due`; and at `alone`, in place of an evaluation."""
+        return step == self.alone or super().due(step)
+
+    def due_when_retired(self, step: int) -> bool:
+        """See `HookConfig.due_when_retired`."""
+        return step == self.alone
 
 
 def depth_inconsistency(error: Tensor, weight: Tensor, tau_u: float) -> Tensor:
@@ -151,6 +175,37 @@ def out_of_sight(
     return alive & ~seen
 
 
+def before_cameras(points: Tensor, cameras: Sequence[View]) -> Tensor:
+    """Which points [K, 3] lie in front of where a camera could stand, bool [K]: nearer to what the cameras look at than
+    one of them, and by an angle to the side of it that is smaller than that to the next. None where fewer than two
+    cameras look at one place."""
+    poses = torch.stack([camera.T_camera_world for camera in cameras]).to(points.device, torch.float64)
+    centres, forwards = torch.stack([camera_centre(pose) for pose in poses]), poses[:, 2, :3]
+    across = torch.eye(3, dtype=poses.dtype, device=poses.device) - forwards[:, :, None] * forwards[:, None]
+    if torch.linalg.eigvalsh(across.sum(0))[0] < PARALLEL * len(poses):
+        return torch.zeros(len(points), dtype=torch.bool, device=points.device)
+    focus = torch.linalg.solve(across.sum(0), (across @ centres[:, :, None]).sum(0)[:, 0])
+    outwards, away = F.normalize(centres - focus, dim=1), (centres - focus).norm(dim=1)
+    towards, distance = F.normalize(points.double() - focus, dim=1), (points.double() - focus).norm(dim=1)
+    nearest = (outwards @ outwards.T).fill_diagonal_(-1).amax(1)  # cosine of the angle to the next camera
+    looks = (outwards * forwards).sum(1) < 0
+    return (looks & (towards @ outwards.T > nearest) & (distance[:, None] < away)).any(1)
+
+
+def alone_before_cameras(backbone: Backbone, cameras: Sequence[View], instants: Iterable[View]) -> Tensor:
+    """Gaussians [N] whose centre one of several cameras that stand still alone sees, `before_cameras`, bool; judged at
+    the one of the instants at which they are most opaque."""
+    alone, most = (torch.zeros(len(backbone), device=cameras[0].K.device) for _ in range(2))
+    for view in instants:
+        splats = backbone.slice_at(view)
+        one = torch.stack([camera.sees(splats.means) for camera in cameras]).sum(0) == 1
+        more = splats.opacities > most[splats.rows]
+        rows = splats.rows[more]
+        alone[rows] = (one & before_cameras(splats.means, cameras))[more].to(alone)
+        most[rows] = splats.opacities[more].to(most)
+    return alone > 0
+
+
 def within_light(remove: Tensor, weight: Tensor, share: float) -> Tensor:
     """Of the rows of `remove` [N], the faintest that together carry at most `share` of all `weight` [N]; at least one,
     so that a bright floater that is alone goes, too."""
@@ -164,7 +219,8 @@ def within_light(remove: Tensor, weight: Tensor, share: float) -> Tensor:
 
 
 class Prune(Hook):
-    """Removes Gaussians whose score stays above tau_p in consecutive evaluations with evidence."""
+    """Removes Gaussians whose score stays above tau_p in consecutive evaluations with evidence, and some that the paper
+    keeps: see `PruneConfig`."""
 
     config: PruneConfig
 
@@ -173,8 +229,22 @@ class Prune(Hook):
         self.settling = config.patience - 1
         self.streak: Tensor | None = None  # [N] evaluations in a row with S_k > tau_p
 
+    @torch.no_grad()
     def edit(self, context: Context) -> Edit | None:
-        """Update the streaks with one evaluation; propose the rows whose streak is long enough."""
+        """Propose what has no evidence for it, or too little; see `PruneConfig`."""
+        remove = self._alone(context) if context.step == self.config.alone else self._scored(context)
+        return Edit(remove=remove) if remove is not None and remove.any() else None
+
+    def _alone(self, context: Context) -> Tensor | None:
+        """What one of three cameras and more alone sees; None where they move, or are two, of which each sees much."""
+        views = context.sample()
+        cameras = context.beside(views[0]) if views else ()
+        if len(cameras) < LEAST_CAMERAS:
+            return None
+        return alone_before_cameras(context.backbone, cameras, context.instants(views[0].camera))
+
+    def _scored(self, context: Context) -> Tensor | None:
+        """Update the streaks with one evaluation; the rows whose streak is long enough, and what is out of sight."""
         if not context.evaluation:
             return None
         config, count = self.config, len(context.backbone)
@@ -193,7 +263,7 @@ class Prune(Hook):
         if config.sight:
             last = config.stop is not None and context.step + config.every >= config.stop
             remove = remove | out_of_sight(context.evaluation, context.beside, count, RIM if last else 0.0)
-        return Edit(remove=remove) if remove.any() else None
+        return remove
 
     def follow(self, index: Tensor) -> None:
         """Streaks move with their Gaussians; new ones start at 0."""
