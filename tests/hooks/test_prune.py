@@ -1,6 +1,7 @@
 """Pruning: the paper's scores, written out, what standing in free space adds, and how much may go at once."""
 
 import logging
+import math
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -223,6 +224,108 @@ def test_in_the_last_evaluation_whose_fringe_alone_is_in_an_image_goes_too(step:
     found = replace(context(here, [view], TinyStore().prior("", 0)), step=step, beside=known.beside)
     edit = Prune(replace(EVERY_ONE, tau_p=1.0, sight=True, every=1, stop=3)).edit(found)
     assert (None if edit is None else edit.remove.tolist()) == goes
+
+
+def ring(*degrees: float, radius: float = 4.0, shift: float = 0.0) -> list[View]:
+    """Cameras on a circle around (`shift`, 0, 0), which look at its middle and see half a unit around that."""
+    K = torch.tensor([[100.0, 0, 16], [0, 100.0, 16], [0, 0, 1]])
+    views = []
+    for degree in degrees:
+        angle = math.radians(degree)
+        outwards = torch.tensor([math.cos(angle), math.sin(angle), 0.0], dtype=torch.float64)
+        up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+        rotation = torch.stack([torch.linalg.cross(up, outwards), -up, -outwards])
+        pose = torch.eye(4, dtype=torch.float64)
+        pose[:3, :3] = rotation
+        pose[:3, 3] = -rotation @ (radius * outwards + torch.tensor([shift, 0.0, 0.0], dtype=torch.float64))
+        views.append(View(f"at {degree:g}", 0, 0.0, pose.float(), K, 32, 32))
+    return views
+
+
+def around(*places: tuple[float, float]) -> Tensor:
+    """Points at some degrees and distances from the origin."""
+    return torch.tensor([[r * math.cos(math.radians(a)), r * math.sin(math.radians(a)), 0.0] for a, r in places])
+
+
+def test_a_camera_could_stand_as_far_beside_another_as_the_next_one_does() -> None:
+    cameras = ring(0, 40, 140)
+    where = around((0, 3), (0, 5), (-39, 3), (-41, 3), (70, 3), (90, 3), (239, 3), (241, 3), (200, 4.1))
+    expected = [True, False, True, False, True, True, True, False, False]
+    assert module.before_cameras(where, cameras).tolist() == expected
+    parallel = [replace(cameras[0], T_camera_world=shifted(cameras[0], x)) for x in (0.0, 0.5, 1.0)]
+    assert not module.before_cameras(where, parallel).any()  # which look at no one place
+    assert not module.before_cameras(where, ring(0, 40, 140, radius=-4)).any()  # which look away from it
+
+
+def shifted(view: View, across: float) -> Tensor:
+    pose = view.T_camera_world.clone()
+    pose[0, 3] += across
+    return pose
+
+
+@given(st.floats(-3, 4), st.floats(-1e3, 1e3), st.integers(0, 2**31))
+def test_where_a_camera_could_stand_has_no_units_and_no_origin(power: float, shift: float, seed: int) -> None:
+    scale, g = 10**power, torch.Generator().manual_seed(seed)
+    points = torch.randn(200, 3, generator=g, dtype=torch.float64) * 3
+    here = module.before_cameras(points, ring(0, 50, 110))
+    away = ring(0, 50, 110, radius=4 * scale, shift=shift * scale)
+    there = module.before_cameras(points * scale + torch.tensor([shift * scale, 0, 0]), away)
+    assert (here != there).sum() <= 2  # poses are float32
+
+
+def test_what_one_camera_alone_sees_goes_at_the_end_and_what_two_see_or_hangs_behind_a_camera_stays() -> None:
+    """Before the camera at 120 degrees; before that at 60, where all see it; behind the one that sees it."""
+    cameras, known = ring(0, 60, 120), ViewSampler()
+    for view in cameras:
+        known.add(view)
+    means = around((120, 2.0), (60, 0.3), (300, 4.5))
+    here = Splats(means, 0.1**2 * torch.tensor([[1.0, 0, 0, 1, 0, 1]] * 3), torch.full((3,), 0.9), torch.arange(3))
+    assert torch.stack([view.sees(means) for view in cameras]).sum(0).tolist() == [1, 3, 1]
+    found = replace(context(here, cameras, TinyStore().prior("", 0)), beside=known.beside, instants=known.instants)
+    hook = Prune(replace(EVERY_ONE, tau_p=1.0, alone=1))
+    edit = hook.edit(found)
+    assert edit is not None
+    assert edit.remove is not None
+    assert edit.remove.tolist() == [True, False, False]
+    assert hook.edit(replace(found, step=2, sample=tuple)) is None
+    for few in (cameras[1:], [*cameras, replace(cameras[0], frame=1, T_camera_world=cameras[1].T_camera_world)]):
+        sampler = ViewSampler()
+        for view in few:
+            sampler.add(view)  # two cameras, or one that moves: nothing is said
+        assert hook.edit(replace(found, beside=sampler.beside, instants=sampler.instants)) is None
+
+
+def test_who_sees_a_gaussian_is_judged_where_it_is_most_opaque() -> None:
+    cameras = ring(0, 60, 120)
+    instants = [replace(cameras[0], frame=frame, time=float(frame)) for frame in range(2)]
+
+    class Moving(Fixed):
+        def slice_at(self, view: View) -> Splats:
+            one, all_ = around((120, 2.0)), torch.zeros(1, 3)
+            order, fades = ([one, all_], [0.9, 0.2]) if view.time == 0 else ([all_, one], [0.3, 0.8])
+            return Splats(torch.cat(order), torch.zeros(2, 6), torch.tensor(fades), torch.arange(2))
+
+    model = Moving(Splats(torch.zeros(2, 3), torch.zeros(2, 6), torch.ones(2), torch.arange(2)), not_now=1)
+    assert module.alone_before_cameras(model, cameras, instants).tolist() == [True, True, False]
+    assert module.alone_before_cameras(model, cameras, instants[:1]).tolist() == [True, False, False]
+
+
+def test_it_comes_once_shortly_before_the_end_whether_or_not_pruning_has_retired() -> None:
+    for iterations in (1, 40, 1000, 30_000):
+        chosen = PruneConfig.for_iterations(iterations)
+        assert chosen.alone is not None
+        assert chosen.due(chosen.alone)
+        assert 1 <= chosen.alone <= iterations
+        assert chosen.stop is not None
+        assert not any(chosen.due(step) for step in range(max(chosen.stop, 1), iterations + 1) if step != chosen.alone)
+    calls: list[int] = []
+    trainer = make_trainer(replace(CONFIG, prune=PruneConfig(start=1, every=1, stop=9, alone=11), retire_after=1), 12)
+    prune = trainer.d2.hooks["prune"]
+    edit = prune.edit
+    prune.edit = lambda found: calls.append(found.step) or edit(found)
+    trainer.d2.retired["prune"] = 0
+    trainer.run()
+    assert calls == [11]
 
 
 def test_what_no_view_shows_by_a_twentieth_of_a_pixel_is_faint_and_what_none_shows_is_not_judged() -> None:
