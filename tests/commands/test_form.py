@@ -78,6 +78,12 @@ def given(*words: str, kind: type = Work) -> Given:
     return form_of(kind).parse([*fixed, *words])
 
 
+def test_of_a_list_that_is_given_twice_the_last_counts_and_that_is_said(caplog: pytest.LogCaptureFixture) -> None:
+    given = form_of().parse(["here", "--output", "there", "--frames", "1", "--steps=3", "--steps=4", "--frames=2,3"])
+    assert (given.values["frames"], given.values["steps"]) == ((2, 3), 4)
+    assert caplog.messages == ["--frames is given twice and 2,3 counts alone: several go in one, with commas"]
+
+
 class TestValues:
     def test_what_is_not_given_keeps_its_default(self) -> None:
         assert given().make(Work) == Work(Path("room"), Path("out"))

@@ -10,6 +10,7 @@ from __future__ import annotations
 import difflib
 import importlib
 import inspect
+import logging
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, is_dataclass
@@ -20,6 +21,8 @@ from d2_plugin.commands.arguments.text import bare, flag_of, item_kind, read
 from d2_plugin.durable import refuse_inside_images
 from d2_plugin.errors import D2Error
 from d2_plugin.settings import Declared, declared
+
+log = logging.getLogger(__name__)
 
 Made = TypeVar("Made")
 
@@ -126,6 +129,8 @@ class Form:
                 text = next(left, "--none")
                 if _is_flag(text):
                     raise D2Error(f"{flag} needs a value: `{self.command} --help` says which")
+            if setting.name in given and item_kind(setting.kind) is not None:
+                log.warning("%s is given twice and %s counts alone: several go in one, with commas", flag, text)
             given[setting.name] = setting, text
         return places, given
 
