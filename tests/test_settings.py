@@ -235,7 +235,7 @@ def run(table: dict[str, Any]) -> RunSettings:
         (run, {"overrides": {"d2": {"densify": 5}}}, r"d2\.densify is a table of its own"),
         (run, {"overrides": {"training": {"seed": 5}}}, r"training\.seed is a setting of the run: give it as --seed"),
         (run, {"overrides": {"prunes": {}}}, r"unknown table 'prunes'.*did you mean 'prune'"),
-        (run, {"overrides": {"version": 1, "prior": "priors", "prune": {}}}, r"is a d2\.toml, .* under \[d2\] and leave"),
+        (run, {"overrides": {"version": 1, "prior": "priors"}}, r"is a d2\.toml, .* under \[d2\], and leave out"),
     ],
 )
 def test_what_cannot_be_meant_is_one_sentence(read: Callable, table: dict[str, Any], sentence: str) -> None:

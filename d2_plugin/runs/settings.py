@@ -132,8 +132,8 @@ def _absolute(path: str, name: str) -> str:
 def _check_overrides(settings: RunSettings) -> None:
     if {"version", "prior"} <= settings.overrides.keys():
         raise D2Error(
-            "the configuration is a d2.toml, which D2Hooks.from_config takes: for a run, put what stands above its first "
-            "table under [d2] and leave out version and prior"
+            "the configuration is a d2.toml, which D2Hooks.from_config takes: for a run, put what stands above its "
+            "first table under [d2], and leave out version and prior"
         )
     refuse_unknown("table", settings.overrides, TABLES)
     choices = _over({}, settings.overrides.get("plan", {}), "plan")
