@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, NamedTuple
 
@@ -192,10 +192,11 @@ def before_cameras(points: Tensor, cameras: Sequence[View]) -> Tensor:
     return (looks & (towards @ outwards.T > nearest) & (distance[:, None] < away)).any(1)
 
 
-def alone_before_cameras(backbone: Backbone, cameras: Sequence[View], instants: Iterable[View]) -> Tensor:
+def alone_before_cameras(backbone: Backbone, cameras: Sequence[View], instants: Sequence[View]) -> Tensor:
     """Gaussians [N] whose centre one of several cameras that stand still alone sees, `before_cameras`, bool; judged at
-    the one of the instants at which they are most opaque."""
-    alone, most = (torch.zeros(len(backbone), device=cameras[0].K.device) for _ in range(2))
+    the one of the instants at which they are most opaque. Those that are not half as opaque at half of them stay: what
+    moves has one camera that sees it more often than a wall has."""
+    most, alone, lasts = (torch.zeros(len(backbone), device=cameras[0].K.device) for _ in range(3))
     for view in instants:
         splats = backbone.slice_at(view)
         one = torch.stack([camera.sees(splats.means) for camera in cameras]).sum(0) == 1
@@ -203,7 +204,10 @@ def alone_before_cameras(backbone: Backbone, cameras: Sequence[View], instants: 
         rows = splats.rows[more]
         alone[rows] = (one & before_cameras(splats.means, cameras))[more].to(alone)
         most[rows] = splats.opacities[more].to(most)
-    return alone > 0
+    for view in instants:
+        splats = backbone.slice_at(view)
+        lasts[splats.rows] += (splats.opacities > most[splats.rows] / 2).to(lasts)
+    return (alone > 0) & (2 * lasts >= len(instants))
 
 
 def within_light(remove: Tensor, weight: Tensor, share: float) -> Tensor:

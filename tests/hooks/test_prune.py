@@ -310,6 +310,8 @@ def test_who_sees_a_gaussian_is_judged_where_it_is_most_opaque() -> None:
     model = Moving(Splats(torch.zeros(2, 3), torch.zeros(2, 6), torch.ones(2), torch.arange(2)), not_now=1)
     assert module.alone_before_cameras(model, cameras, instants).tolist() == [True, True, False]
     assert module.alone_before_cameras(model, cameras, instants[:1]).tolist() == [True, False, False]
+    later = [replace(cameras[0], frame=frame, time=1.0) for frame in range(2, 4)]
+    assert module.alone_before_cameras(model, cameras, instants + later).tolist() == [False, True, False]  # it is short
 
 
 def test_it_comes_once_shortly_before_the_end_whether_or_not_pruning_has_retired() -> None:
