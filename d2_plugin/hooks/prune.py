@@ -29,13 +29,11 @@ RIM = 0.1
 """In the last evaluation a Gaussian's centre must lie in an image by this share of its size: of one whose fringe alone
 is seen most is not, and a held-out camera sees it whole."""
 
-
 LEAST_CAMERAS = 3
 """Of two, each sees much of what there is alone."""
 
 PARALLEL = 1e-4
-"""Optical axes meet nowhere where the least eigenvalue of the sum of what projects across them is smaller than this, of
-each."""
+"""Optical axes are parallel and meet nowhere where the mean of what projects across them has a smaller eigenvalue."""
 
 
 @dataclass(frozen=True)
