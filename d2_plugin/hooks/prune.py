@@ -174,9 +174,9 @@ def out_of_sight(
 
 
 def before_cameras(points: Tensor, cameras: Sequence[View]) -> Tensor:
-    """Which world points [K, 3] lie in front of where a camera could stand, bool [K]: nearer to what the cameras look at
-    than one of them, and by an angle to the side of it that is smaller than that to the next. None where fewer than two
-    cameras look at one place."""
+    """Which world points [K, 3] lie in front of where a camera could stand, bool [K]: nearer to what the cameras look
+    at than one of them, and by an angle to the side of it that is smaller than that to the next. None where fewer than
+    two cameras look at one place."""
     poses = torch.stack([camera.T_camera_world for camera in cameras]).to(points.device, torch.float64)
     centres, forwards = torch.stack([camera_centre(pose) for pose in poses]), poses[:, 2, :3]
     across = torch.eye(3, dtype=poses.dtype, device=poses.device) - forwards[:, :, None] * forwards[:, None]
