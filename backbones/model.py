@@ -296,6 +296,8 @@ class SplatModel(ABC):
         `settings.dispensable` says how many in a run of `LONG` iterations, by the squared error of the render of each
         view against `image(index)` [H, W, 3], in which each pixel counts as much as `weights(index)` [H, W] says.
         """
+        if not self.settings.dispensable:
+            return
         ordered = sorted(views, key=lambda view: (view.camera, view.time))
         following = ordered[1:]
         between = [replace(a, time=(a.time + b.time) / 2) for a, b in zip(ordered, following) if a.camera == b.camera]
