@@ -54,7 +54,7 @@ INSTANTS = 4
 """Of the recording in a trial, evenly spread."""
 MOST_LEFT_OUT = 4
 """Cameras that are left out, spread evenly in the order in which they are named."""
-CLEAR = 0.03
+CLEAR = 0.025
 """How far ahead in the sum either belief is where no further camera is needed, if the two or more so far agree."""
 DECIBEL = 0.02
 """What a decibel of PSNR counts beside SSIM: in full runs both rise together so."""
