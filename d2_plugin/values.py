@@ -7,7 +7,7 @@ import inspect
 import math
 import types
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence, Set
-from dataclasses import dataclass, is_dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, Union, cast, get_args, get_origin
 
@@ -224,7 +224,7 @@ def _noun(kind: Any) -> str:
         return "a list"
     if get_origin(kind) is Mapping or kind is Mapping:
         return "a table"
-    if get_origin(kind) is not None or is_dataclass(kind):
+    if get_origin(kind) is not None or hasattr(kind, "from_dict"):
         return "a table of settings"
     words = {int: "a whole number", float: "a number", bool: "true or false", str: "text", Path: "a path"}
     return words.get(kind) or f"a {kind.__name__}"

@@ -15,6 +15,7 @@ from d2_plugin.protocol import Label
 from d2_plugin.recordings.recording import Recording
 from d2_plugin.recordings.selection import spread
 from d2_plugin.store.store import PriorStore
+from d2_plugin.values import checked_arguments
 
 DECLARED = (Label.VERIFIED, Label.AGREED, Label.MONO)
 """Labels whose sigma is held against the truth; far pixels claim only a lower bound of depth."""
@@ -76,6 +77,7 @@ def frames_with_truth(recording: Recording, cameras: Sequence[str], most: int | 
     return frames if most is None or len(frames) <= most else spread(frames, most)
 
 
+@checked_arguments
 def held_against_truth(
     store: PriorStore, recording: Recording, frames: Sequence[int] | None = None
 ) -> DeclaredErrors | None:
