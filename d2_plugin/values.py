@@ -234,6 +234,11 @@ def _wrong(name: str, must: str, value: Any) -> D2Error:
     return D2Error(f"{name} {must}, got {shown(value)}")
 
 
+def counted(number: int, one: str, form: str = "") -> str:
+    """A number of things, each of which is called `one`: `1 frame`, `2 frames`; `form` is that of the number."""
+    return f"{number:{form}} {one}{'' if number == 1 else 's'}"
+
+
 def shown(value: Any) -> str:
     """A value on one short line."""
     try:

@@ -24,6 +24,7 @@ from d2_plugin.priors.settings import PriorSettings
 from d2_plugin.priors.stereo.matched_depth import frame_blocks
 from d2_plugin.priors.summary import PriorSummary
 from d2_plugin.recordings.recording import Recording
+from d2_plugin.values import counted
 
 PARTS_PER_WORKER = 4
 """Parts are handed out as workers become free. More parts even out frames that take longer; each part loads the
@@ -89,7 +90,7 @@ def _joined(parts: list[Any], total: int, progress: Progress) -> PriorSummary:
             ) from None
         summary.add_part(part)
         done += part.built + part.kept
-        progress(done, total, f"a part of {part.built + part.kept} images")
+        progress(done, total, f"a part of {counted(part.built + part.kept, 'image')}")
     return summary
 
 
