@@ -17,6 +17,7 @@ import json
 import os
 import secrets
 import stat
+import tempfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
@@ -62,7 +63,7 @@ def cannot_write(path: Path, error: OSError) -> CannotWrite:
     if error.errno in FULL:
         advice = "make room"
     elif error.errno in FORBIDDEN:
-        advice = "choose a folder that you may write"
+        advice = "make it writable or choose a folder that you may write"
     reason = error.strerror or str(error)
     if error.errno in NO_PLACE:
         return CannotWrite(f"cannot write {path} ({reason}): choose another place")
@@ -85,6 +86,14 @@ def make_folder(path: Path) -> Path:
     with writing(path):
         path.mkdir(parents=True, exist_ok=True)
     return path
+
+
+def refuse_unwritable(folder: Path) -> None:
+    """Refuse an existing folder in which no file can be made, before the work whose results it would get."""
+    with writing(folder):
+        descriptor, probe = tempfile.mkstemp(LEFTOVER, ".", folder)
+        os.close(descriptor)
+        os.unlink(probe)
 
 
 def write(path: Path, *parts: bytes | memoryview, synced: bool = True) -> None:

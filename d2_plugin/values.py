@@ -7,7 +7,7 @@ import inspect
 import math
 import types
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence, Set
-from dataclasses import dataclass, is_dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, Union, cast, get_args, get_origin
 
@@ -224,7 +224,7 @@ def _noun(kind: Any) -> str:
         return "a list"
     if get_origin(kind) is Mapping or kind is Mapping:
         return "a table"
-    if get_origin(kind) is not None or is_dataclass(kind):
+    if get_origin(kind) is not None or hasattr(kind, "from_dict"):
         return "a table of settings"
     words = {int: "a whole number", float: "a number", bool: "true or false", str: "text", Path: "a path"}
     return words.get(kind) or f"a {kind.__name__}"
@@ -232,6 +232,11 @@ def _noun(kind: Any) -> str:
 
 def _wrong(name: str, must: str, value: Any) -> D2Error:
     return D2Error(f"{name} {must}, got {shown(value)}")
+
+
+def counted(number: int, one: str, form: str = "") -> str:
+    """A number of things, each of which is called `one`: `1 frame`, `2 frames`; `form` is that of the number."""
+    return f"{number:{form}} {one}{'' if number == 1 else 's'}"
 
 
 def shown(value: Any) -> str:

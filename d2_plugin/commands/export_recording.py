@@ -15,6 +15,7 @@ from d2_plugin.recordings.export.export import export_recording
 from d2_plugin.recordings.export.ply import PointCloud
 from d2_plugin.runs.start import MIN_POINTS, initial_points, scene_extent, triangulated_points
 from d2_plugin.settings import Count, Downscale, Positional, Range, Seed, Settings
+from d2_plugin.values import counted
 
 
 @dataclass(frozen=True)
@@ -51,9 +52,8 @@ def run(settings: RecordingExport) -> str:
     cloud = start_cloud(recording, train, settings.points, settings.seed) if settings.points > 0 else None
     folder = export_recording(recording, settings.format, settings.output, test_cameras=held_out, cloud=cloud)
     written = read_json(folder / EXPORT_FILE, "export again")
-    points = "no" if cloud is None else len(cloud.positions)
-    frames = f"{len(written['frames'])} frame{'s' * (len(written['frames']) != 1)}"
-    what = f"{len(written['cameras'])} cameras, {frames}, {points} initial points"
+    points = "no initial points" if cloud is None else counted(len(cloud.positions), "initial point")
+    what = ", ".join([*(counted(len(written[f"{one}s"]), one) for one in ("camera", "frame")), points])
     return f"{what} in {settings.output} ({settings.format})"
 
 

@@ -6,6 +6,7 @@ from d2_plugin.commands.arguments.recording import show_notes
 from d2_plugin.progress import show
 from d2_plugin.recordings.importing.importing import import_videos
 from d2_plugin.recordings.importing.settings import ImportSettings
+from d2_plugin.values import counted
 
 __all__ = ["ImportSettings", "run"]
 
@@ -16,6 +17,6 @@ def run(settings: ImportSettings) -> str:
     show_notes(recording.notes)
     sizes = sorted({(camera.width, camera.height) for camera in recording.cameras.values()})
     shown = ", ".join(f"{width}x{height}" for width, height in sizes)
-    frames = f"{len(recording.frames)} frame{'s' * (len(recording.frames) != 1)} at {recording.rate:g} per second"
+    frames = f"{counted(len(recording.frames), 'frame')} at {recording.rate:g} per second"
     plan = f"`d2 plan {settings.output} --train-cameras all` says what is used and what is left out"
-    return f"{len(recording.cameras)} cameras, {frames}, {shown} pixels in {settings.output}\n{plan}"
+    return f"{counted(len(recording.cameras), 'camera')}, {frames}, {shown} pixels in {settings.output}\n{plan}"

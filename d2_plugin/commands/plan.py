@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from d2_plugin.commands.arguments.form import Form, Given
 from d2_plugin.commands.arguments.recording import recording_form, run_settings, show_notes, show_plan
 from d2_plugin.progress import show
+from d2_plugin.values import counted
 
 if TYPE_CHECKING:
     from d2_plugin.recordings import Recording
@@ -35,7 +36,7 @@ def described(recording: Recording) -> str:
     cameras, frames = list(recording.cameras), recording.frames
     sizes = " or ".join(dict.fromkeys(f"{camera.width}x{camera.height}" for camera in recording.cameras.values()))
     when = f"frames {frames[0]} to {frames[-1]} ({len(frames)})" if len(frames) > 1 else f"frame {frames[0]}"
-    who = f"{len(cameras)} camera{'' if len(cameras) == 1 else 's'} ({', '.join(cameras)})"
+    who = f"{counted(len(cameras), 'camera')} ({', '.join(cameras)})"
     when += f" at {recording.rate:g} per second"
     return f"{recording.name}: layout {recording.layout}, {who}, {when}, {sizes} pixels"
 

@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 
 from d2_plugin.errors import D2Error, refuse_unknown
 from d2_plugin.settings import AtATime, Count, Positional, Range, Seed, Settings
+from d2_plugin.values import counted
 
 
 @dataclass(frozen=True)
@@ -77,7 +78,7 @@ def run(settings: ProtocolRun) -> str:
     without = [column.title for column in columns if not any(group.scores(column) for group in groups)]
     lines = [
         f"{settings.name}: trains on {', '.join(train)}, scores {', '.join(test or ())}; "
-        f"{'x'.join(map(str, about['size']))} pixels, {len(frames)} frame{'s' * (len(frames) > 1)}, {iterations} steps",
+        f"{'x'.join(map(str, about['size']))} pixels, {counted(len(frames), 'frame')}, {counted(iterations, 'step')}",
         markdown(scores_table(groups, columns)),
         *(f"not as published: {line}" for line in about["differs"]),
         *([f"published and not measured here: {', '.join(without)}"] if without else []),

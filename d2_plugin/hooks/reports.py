@@ -17,6 +17,7 @@ from d2_plugin.hooks import HOOKS
 from d2_plugin.hooks.hook import Hook, HookConfig
 from d2_plugin.hooks.prior import PriorLoader
 from d2_plugin.protocol import Backbone, schedule_step
+from d2_plugin.values import counted
 
 log = logging.getLogger(__name__)
 
@@ -141,7 +142,7 @@ class RunLog:
         above = f" ({self.capped} above max_gaussians)" if self.capped else ""
         changes = f"{self.inserted} inserted, {self.removed} removed{above}, {self.others:+d} by the trainer itself"
         losses = [f"{name} {mean.first:.3g} at first, {mean.now():.3g} at last" for name, mean in self._terms.items()]
-        after = f"{self.gaussians} Gaussians after step {self.last_step}"
+        after = f"{counted(self.gaussians, 'Gaussian')} after step {self.last_step}"
         return "; ".join([f"{', '.join(self.hooks) or 'no hook'}: {changes}, {after}", *losses])
 
     def end(self) -> None:

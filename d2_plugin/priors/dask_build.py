@@ -8,6 +8,7 @@ part is started again elsewhere and finds there what was finished.
 from __future__ import annotations
 
 import logging
+import socket
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -23,6 +24,7 @@ from d2_plugin.priors.settings import PriorSettings
 from d2_plugin.priors.stereo.matched_depth import frame_blocks
 from d2_plugin.priors.summary import PriorSummary
 from d2_plugin.recordings.recording import Recording
+from d2_plugin.values import counted
 
 PARTS_PER_WORKER = 4
 """Parts are handed out as workers become free. More parts even out frames that take longer; each part loads the
@@ -88,7 +90,7 @@ def _joined(parts: list[Any], total: int, progress: Progress) -> PriorSummary:
             ) from None
         summary.add_part(part)
         done += part.built + part.kept
-        progress(done, total, f"a part of {part.built + part.kept} images")
+        progress(done, total, f"a part of {counted(part.built + part.kept, 'image')}")
     return summary
 
 
@@ -101,8 +103,11 @@ def cluster_client(scheduler: str | None, workers: int, purpose: str = "building
     distributed = imported("distributed", "dask.distributed", "cluster", purpose)
     if scheduler is not None:
         try:
-            # A client that never connected ends its process slowly.
-            distributed.comm.get_address_host_port(scheduler)
+            # A client asks in vain for ten seconds whatever the address is, and then ends its process slowly.
+            host, port = distributed.comm.get_address_host_port(scheduler)
+            if not 0 < port < 1 << 16:
+                raise ValueError("ports are 1 to 65535")
+            socket.getaddrinfo(host, port)
             certificates = distributed.Security().get_connection_args("client")["ssl_context"]
             if scheduler.startswith("tls://") and certificates is None:
                 raise ValueError("TLS needs distributed.comm.tls in dask's configuration")

@@ -15,6 +15,7 @@ from d2_plugin.protocol import Label
 from d2_plugin.recordings.recording import Recording
 from d2_plugin.recordings.selection import spread
 from d2_plugin.store.store import PriorStore
+from d2_plugin.values import checked_arguments, counted
 
 DECLARED = (Label.VERIFIED, Label.AGREED, Label.MONO)
 """Labels whose sigma is held against the truth; far pixels claim only a lower bound of depth."""
@@ -59,7 +60,7 @@ class DeclaredErrors:
 
     def __str__(self) -> str:
         header = f"{'label':10}{'share':>9}{'within sigma':>15}{'2 sigma':>10}{'sigma':>9}{'error':>9}"
-        lines = [f"held against the true depth of {self.views} views:"]
+        lines = [f"held against the true depth of {counted(self.views, 'view')}:"]
         lines.append(header if self.labels else "no pixel with a true depth has a finite sigma")
         for label, errors in self.labels.items():
             shares = f"{errors.share:9.1%}{errors.within:15.1%}{errors.within_two:10.1%}"
@@ -76,6 +77,7 @@ def frames_with_truth(recording: Recording, cameras: Sequence[str], most: int | 
     return frames if most is None or len(frames) <= most else spread(frames, most)
 
 
+@checked_arguments
 def held_against_truth(
     store: PriorStore, recording: Recording, frames: Sequence[int] | None = None
 ) -> DeclaredErrors | None:

@@ -14,6 +14,7 @@ from d2_plugin.recordings.images import opencv, write_png
 from d2_plugin.recordings.recording import Recording
 from d2_plugin.recordings.selection import spread
 from d2_plugin.store.store import PriorStore
+from d2_plugin.values import checked_arguments
 
 LABEL_COLORS = {
     Label.EMPTY: (40, 40, 40),
@@ -40,6 +41,7 @@ TITLES = (
 CAPTION = 18  # height of a line of text, pixels
 
 
+@checked_arguments
 def contact_sheet(
     store: PriorStore,
     recording: Recording,

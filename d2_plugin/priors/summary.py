@@ -101,7 +101,8 @@ class PriorSummary:
         """The prior in one line: how many views have one, which cameras have none, and every reason of a refusal."""
         used = {camera: self._used(camera) for camera in self._cameras()}
         without = [camera for camera, count in used.items() if not count]
-        parts = [f"prior: {sum(used.values())} of {len(self.views)} views are usable"]
+        views = "1 view is" if len(self.views) == 1 else f"{len(self.views)} views are"
+        parts = [f"prior: {sum(used.values())} of {views} usable"]
         parts += [f"none of camera{'' if len(without) == 1 else 's'} {', '.join(without)}"] if without else []
         parts += [f"maps refused {self.reasons()}"] if self.refused else []
         return "; ".join(parts)

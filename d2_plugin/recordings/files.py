@@ -15,6 +15,7 @@ from typing import NamedTuple, Optional
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.reading import shown_path
 from d2_plugin.recordings.images import IMAGE_SUFFIXES
+from d2_plugin.values import counted
 
 FrameFiles = dict[int, Path]
 
@@ -87,7 +88,7 @@ def common_frames(files: Mapping[str, Iterable[int]], where: Path) -> tuple[tupl
     if not shared:
         raise D2Error(f"no frame in {where} is there for all of {', '.join(files)}: give every camera the same frames")
     out = len(every - shared)
-    return tuple(sorted(shared)), (f"{out} frame{'s' * (out > 1)} left out: not every camera has them",) if out else ()
+    return tuple(sorted(shared)), (f"{counted(out, 'frame')} left out: not every camera has them",) if out else ()
 
 
 def cameras_with_images(

@@ -24,6 +24,7 @@ from d2_plugin.durable import append
 from d2_plugin.errors import D2Error
 from d2_plugin.reading import field, json_text, opened, parse_json, read_text
 from d2_plugin.settings import Settings, declared
+from d2_plugin.values import counted
 
 if TYPE_CHECKING:
     from d2_plugin.runs.settings import RunSettings
@@ -83,7 +84,7 @@ def rms_error(scores: Mapping[str, float | None]) -> float | None:
 
 def case_name(recording: str, settings: RunSettings) -> str:
     """The recording, how many cameras trained, what of it was used where that is not all, and the protocol."""
-    parts = [recording, f"{len(settings.train_cameras)} views"]
+    parts = [recording, counted(len(settings.train_cameras), "view")]
     parts += [f"1/{settings.downscale} size"] if settings.downscale > 1 else []
     parts += [f"1/{settings.hold_out_instants} of the instants"] if settings.hold_out_instants > 1 else []
     return ", ".join([*parts, *([settings.protocol] if settings.protocol else [])])

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from d2_plugin import registry
-from d2_plugin.durable import read_table, remove_leftovers, write_table, write_text
+from d2_plugin.durable import read_table, refuse_unwritable, remove_leftovers, write_table, write_text
 from d2_plugin.errors import D2Error
 from d2_plugin.locks import only_writer
 from d2_plugin.plugin import D2Hooks
@@ -257,6 +257,7 @@ class Run:
             yield
             return
         with only_writer(self.folder):
+            refuse_unwritable(self.folder)
             for folder in (self.folder, self.folder / "images"):
                 remove_leftovers(folder, below=False)
             self._writes = True

@@ -22,7 +22,7 @@ from d2_plugin.hooks import finite
 from d2_plugin.hooks.finite import Diverged
 from d2_plugin.locks import only_writer
 from d2_plugin.reading import parsing
-from d2_plugin.runs.settings import RunSettings
+from d2_plugin.runs.settings import PATHS, RunSettings
 from d2_plugin.values import shown
 
 RUN = durable.Kind("table of settings", 1, "run `d2 train` with another --output, or remove that folder")
@@ -69,6 +69,18 @@ def claim(folder: Path, identity: Mapping[str, Any]) -> None:
             _refuse_another(folder, identity)
         else:
             durable.write_table(folder / "run.json", dict(identity), RUN)
+
+
+def follow_moved(folder: Path, settings: RunSettings) -> None:
+    """Let run.json, where there is one, say where files of the same name lie now in place of those that are gone."""
+    if not (folder / "run.json").exists():
+        return
+    table, now = read_run(folder), settings.as_table()
+    gone = [name for name in PATHS if table.get(name) and now[name] and not Path(table[name]).exists()]
+    moved = {name: now[name] for name in gone if Path(now[name]).name == Path(table[name]).name}
+    if moved:
+        with only_writer(folder):
+            durable.write_table(folder / "run.json", table | moved, RUN)
 
 
 def _refuse_another(folder: Path, identity: Mapping[str, Any]) -> None:

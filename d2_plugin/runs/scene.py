@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 from pathlib import Path
 from typing import Any, Protocol
 
 from d2_plugin import registry
 from d2_plugin.errors import D2Error, refuse_unknown
 from d2_plugin.hooks import Hook
+from d2_plugin.priors.geometry import same_spot
 from d2_plugin.priors.settings import PriorSettings
 from d2_plugin.recordings import Recording, open_recording
 from d2_plugin.recordings.cameras.check import check_background_weight, check_recording
@@ -66,6 +68,7 @@ class Scene:
         check_memory(recording, train)
         check_background_weight(recording, train, settings.background_weight)
         notes = (*recording.notes, *check_recording(recording, (*train, *test), scored=test))
+        notes += (*_at_one_point(recording, train),)
         for name in sorted({*settings.hooks} - {*hooks_in_use(settings), "prior"}):
             notes += (f"a run of {settings.iterations} steps leaves `{name}` out: a table [{name}] brings it back",)
         recording = replace(recording, notes=notes)
@@ -143,6 +146,15 @@ def _without_held_out_instants(recording: Recording, every: int) -> tuple[Record
         )
     between = tuple(frame for frame in recording.frames if frame not in trained and frame < trained[-1])
     return replace(recording, frames=trained), between
+
+
+def _at_one_point(recording: Recording, cameras: Sequence[str]) -> Iterator[str]:
+    """Which training cameras stereo learns nothing from together; where it is all of them, the plan says so."""
+    at = {name: recording.cameras[name] for name in cameras}
+    pairs = [f"{one} and {other}" for one, other in combinations(at, 2) if same_spot(at[one], at[other])]
+    if 0 < 2 * len(pairs) < len(at) * (len(at) - 1):
+        listed = ", ".join(pairs[:4]) + (", ..." if len(pairs) > 4 else "")
+        yield f"cameras {listed} stand at one point and give no depth together: correct their poses if they do not"
 
 
 def _split(recording: Recording, settings: RunSettings) -> tuple[tuple[str, ...], tuple[str, ...]]:

@@ -34,6 +34,8 @@ WORTH_FROM = {"motion": 200, "parallax": 500}
 """Steps from which hooks that look between what was recorded are worth their time; a shorter run makes more steps."""
 TABLES = ("backbone", "training", "d2", *HOOKS, "priors", "plan")
 """What a configuration file may hold."""
+PATHS = ("recording", "mono_onnx", "multiview", "priors")
+"""The settings of a run that are paths."""
 
 
 @dataclass(frozen=True)
@@ -117,8 +119,7 @@ def check(settings: RunSettings) -> RunSettings:
     if settings.device == "cuda" and not torch.cuda.is_available():
         raise D2Error("--device cuda, but torch finds no CUDA device here: leave out --device to train on the CPU")
     _check_overrides(settings)
-    paths = ("recording", "mono_onnx", "multiview", "priors")
-    absolute = {name: _absolute(path, name) for name in paths if (path := getattr(settings, name)) is not None}
+    absolute = {name: _absolute(path, name) for name in PATHS if (path := getattr(settings, name)) is not None}
     return replace(settings, **absolute)  # type: ignore[arg-type]  # a run is found again from any folder
 
 

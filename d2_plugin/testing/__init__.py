@@ -22,6 +22,7 @@ from d2_plugin.protocol import RasterSettings
 from d2_plugin.testing.editing import EDITING, state_round_trip
 from d2_plugin.testing.example import Check, Example
 from d2_plugin.testing.reading import READING
+from d2_plugin.values import counted
 
 __all__ = ["CHECKS", "ContractError", "Example", "check_backbone"]
 
@@ -86,4 +87,4 @@ def _missing_members(example: Example) -> Iterator[str]:
     if not isinstance(getattr(example.backbone, "settings", None), RasterSettings):
         yield "settings must be a RasterSettings, the constants of the backbone's own rasterizer"
     if len(example.cameras) < 2:
-        yield f"the example has {len(example.cameras)} cameras: give at least 2"
+        yield f"the example has {counted(len(example.cameras), 'camera')}: give at least 2"

@@ -152,7 +152,14 @@ def test_a_part_that_cannot_be_built_is_refused(recording: Path, tmp_path, refus
 
 @pytest.mark.parametrize("command", [("priors", "nowhere", "--train-cameras", "a"), ("bench", "training", "nowhere@a")])
 @pytest.mark.parametrize(
-    ("at", "why"), [("there", "missing port"), ("tls://127.0.0.1:1", "TLS"), ("tcp://127.0.0.1:1", "Timed out")]
+    ("at", "why"),
+    [
+        ("there", "missing port"),
+        ("tcp://nohost.invalid:8786", "[Errno"),
+        ("tcp://127.0.0.1:99999", "ports are 1 to 65535"),
+        ("tls://127.0.0.1:1", "TLS"),
+        ("tcp://127.0.0.1:1", "Timed out"),
+    ],
 )
 def test_a_cluster_that_is_not_there_is_refused_before_anything_is_read(refused, monkeypatch, command, at, why) -> None:
     distributed = pytest.importorskip("distributed", reason="dask.distributed is in the `cluster` extra")

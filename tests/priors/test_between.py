@@ -3,16 +3,17 @@
 import itertools
 import tracemalloc
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
+from prior_cases import camera_at, showing
 
 from d2_plugin.priors.between import build_between
 from d2_plugin.priors.scene_flow import Flight, common_acceleration, dense_flow, followed, regions
 from d2_plugin.priors.sheet import contact_sheet
 from d2_plugin.protocol import Label
+from d2_plugin.recordings.recording import Recording, Source
 from d2_plugin.store.exported import RenamedStore
 from d2_plugin.store.maps import FusedPrior
 from d2_plugin.store.store import QUARTERS, PriorStore
@@ -221,7 +222,9 @@ class TestHalfway:
         assert renamed.coded_underway("a", 11, 2) is None  # frame 3 was not exported
 
     def test_the_contact_sheet_shows_it_below_the_priors(self, flown: PriorStore, tmp_path: Path) -> None:
-        recording = SimpleNamespace(frames=flown.frames, image=lambda camera, frame: shown(ball(*way(frame))))
+        cameras = dict.fromkeys(flown.cameras, camera_at(size=(WIDTH, HEIGHT)))
+        still = Recording("thrown", cameras, flown.frames, 1.0, Source())
+        recording = showing(still, {"image": lambda camera, frame: shown(ball(*way(frame)))})
         stores = thrown(tmp_path, 5, 2), flown
         alone, both = (
             cv2.imread(str(contact_sheet(store, recording, tmp_path / "sheet.png", [0], width=64))) for store in stores

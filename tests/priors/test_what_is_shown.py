@@ -59,6 +59,7 @@ def test_the_table_counts_normal_errors_as_normal(tmp_path: Path) -> None:
         assert held.error == pytest.approx(0.674 * declared, rel=0.05)
     assert np.isnan(found.sky_found)
     assert "mono only" in str(found)
+    assert str(found).startswith("held against the true depth of 1 view:")
 
 
 def test_far_pixels_count_against_the_sky_and_infinite_sigma_promises_nothing(tmp_path: Path, small: Recording) -> None:
@@ -105,6 +106,9 @@ def test_the_summary_shows_median_sigma_and_parts_add_up() -> None:
     assert whole.headline() == "prior: 3 of 4 views are usable; none of camera b; maps refused 1x no depth"
     whole.add("b", 1, {"shares": nothing | {"far": 1.0}, "refused": ""}, False)
     assert whole.headline().startswith("prior: 4 of 5 views are usable; maps")
+    alone = PriorSummary()
+    alone.add("a", 0, record(0.001, None), True)
+    assert alone.headline() == "prior: 1 of 1 view is usable"
 
 
 def test_the_summary_says_whether_monocular_maps_know_more_than_the_stereo_around() -> None:

@@ -158,6 +158,8 @@ def test_the_command_writes_points_and_says_where(tmp_path: Path, answered, refu
     assert "is not empty: choose another" in refused(*command.split())
     one = f"{source} --format gsplat --output {tmp_path / 'one'} --points 0 --test-cameras 00"
     assert answered("export-recording", *one.split()).startswith("4 cameras, 1 frame, no initial points in")
+    alone = f"{source} --format transforms --output {tmp_path / 'alone'} --points 0 --train-cameras 02 --frames 1"
+    assert answered("export-recording", *alone.split()).startswith("1 camera, 1 frame, no initial points in")
     content = json.loads((tmp_path / "scene" / "export.json").read_text())
     assert (list(content["cameras"]), content["test_cameras"]) == (["00", "02", "01"], ["01"])
     assert int((tmp_path / "scene" / "points3d.ply").read_bytes().split(b"element vertex ")[1].split()[0]) >= 50

@@ -114,7 +114,7 @@ def test_missing_images_are_named_and_left_out_only_when_asked(tmp_path: Path) -
     refused(tmp_path, r"cam07_0001\.png is listed in .*transforms\.json but is not there \(1 of 4")
     recording = open_recording(tmp_path, intersect=True)
     assert recording.frames == (0,)
-    assert any("1 listed images" in note for note in recording.notes)
+    assert any("1 listed image left out" in note for note in recording.notes)
     refused(tmp_path, "unknown camera 'cam1'", cameras=["cam1"], intersect=True)
 
 

@@ -17,6 +17,7 @@ from d2_plugin.runs.ablation.ablate import order_table, report, table
 from d2_plugin.runs.ablation.presets import PRESETS, TABLES, rows_named
 from d2_plugin.runs.settings import RunSettings, check
 from d2_plugin.runs.verdict import EXPLANATION
+from d2_plugin.viewing.viewed import viewed_run
 
 
 class TestPresets:
@@ -126,6 +127,24 @@ def test_the_command_trains_shares_priors_and_repeats_nothing(saved_room, tmp_pa
         write_grey(path, 99, (96, 54))  # another recording in a folder of the same name
     assert "holds a run of `d2 train`: give" in refused(*command[:-1], str(next(iter(checkpoints)).parent))
     assert "of another frames, recording: give" in refused(*command, "--rows", "no_rgbd", "--frames", "0")
+
+
+def test_an_ablation_goes_on_where_it_and_its_recording_were_moved(saved_room, tmp_path, refused, monkeypatch) -> None:
+    shutil.copytree(saved_room(cameras=2, held_out=1, frames=2, width=96, height=54), tmp_path / "old" / "room")
+    command = ["ablate", "room", "--train-cameras", "train0,train1", "--rows", "main", "--iterations", "2"]
+    command += ["--jobs", "1", "--output", "out", "--seeds"]
+    monkeypatch.chdir(tmp_path / "old")
+    with measured_at_once():
+        assert main([*command, "0"]) == 0
+    moved = shutil.move(tmp_path / "old", tmp_path / "new")
+    monkeypatch.chdir(moved)
+    with measured_at_once():
+        assert main([*command, "0,1"]) == 0
+    rows = (moved / "out" / "runs.jsonl").read_text().splitlines()
+    assert [json.loads(row)["seed"] for row in rows] == [0, 0, 1, 1]
+    assert viewed_run(moved / "out" / "yang4d" / "full" / "seed0").store is not None, "run.json says where they are now"
+    monkeypatch.chdir(shutil.copytree(moved, tmp_path / "copy"))
+    assert "other settings of priors, recording: give" in refused(*command, "0"), "what is still there was not moved"
 
 
 def test_without_a_camera_held_out_nothing_is_trained(saved_room, tmp_path, refused) -> None:

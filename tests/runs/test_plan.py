@@ -108,6 +108,19 @@ def test_what_cannot_be_is_not_overridden(moving) -> None:
     refuses("all training cameras stand at one point: it takes cameras that stand apart", plan.override, stereo=True)
 
 
+def test_training_cameras_at_one_point_are_named_once(moving, tmp_path: Path) -> None:
+    first = moving.cameras["train0"]
+    turned = rigid(rotation_of_vector(np.array([0, 0.05, 0])), np.zeros(3)) @ first.T_camera_world
+    same = {"train1": replace(first, name="train1", T_camera_world=turned)}
+    save_recording(replace(moving, cameras={**moving.cameras, **same}), tmp_path / "room")
+    notes = [
+        [note for note in Scene.open(RunSettings(str(tmp_path / "room"), names)).recording.notes if "point" in note]
+        for names in (("train0", "train1", "train2"), ("train0", "train2"), ("train0", "train1"))
+    ]
+    said = "cameras train0 and train1 stand at one point and give no depth together: correct their poses if they do not"
+    assert notes == [[said], [], []], "a held-out one needs none, and of all of them the plan says it"
+
+
 def camera(name: str, x: float = 0.0, turn: float = 0.0, near_far: tuple[float, float] | None = None) -> Camera:
     """At (x, 0, 0), turned to the right by `turn` degrees; 100 pixels wide, 53 degrees."""
     rotation = rotation_of_vector(np.array([0, -np.deg2rad(turn), 0]))

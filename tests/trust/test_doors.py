@@ -20,6 +20,8 @@ from d2_plugin.commands import cli
 from d2_plugin.commands.cli import main
 from d2_plugin.config import D2Config
 from d2_plugin.errors import D2Error
+from d2_plugin.priors.declared_error import held_against_truth
+from d2_plugin.priors.sheet import contact_sheet
 from d2_plugin.recordings import Recording, open_recording, select_cameras, select_frames
 from d2_plugin.recordings.cameras.calibrating import Board, refine, scaled_by_board, solve_rig
 from d2_plugin.recordings.cameras.calibration import open_calibration
@@ -232,6 +234,7 @@ def of_a_recording(path: Path, recording: Recording) -> dict[str, Call]:
     calibration = path / "cameras.json"
     (first, *_) = open_calibration(calibration).cameras
     folder = path.parent / "never"
+    store = PriorStore(folder, ["cam00"], [0], {})
     return {
         "cameras": lambda wrong: open_recording(path, cameras=wrong if wrong is not None else "cam00"),
         "frames": lambda wrong: open_recording(path, frames=wrong if wrong is not None else "01"),
@@ -254,6 +257,10 @@ def of_a_recording(path: Path, recording: Recording) -> dict[str, Call]:
         "import_videos": import_videos,
         "save_recording": lambda wrong: save_recording(wrong, folder),
         "export_recording": lambda wrong: export_recording(wrong, "transforms", folder),
+        "a store's sheet": lambda wrong: contact_sheet(wrong, recording, folder),
+        "a recording's sheet": lambda wrong: contact_sheet(store, wrong, folder),
+        "a store's errors": lambda wrong: held_against_truth(wrong, recording),
+        "a recording's errors": lambda wrong: held_against_truth(store, wrong),
         "held out": lambda wrong: export_recording(recording, "n3dv", folder, test_cameras=wrong),
     }
 
@@ -298,6 +305,12 @@ def test_what_is_no_image(image: np.ndarray, tmp_path: Path) -> None:
     ):
         add(image)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_path_in_the_place_of_what_lies_there_is_called_by_its_kind(small: Path) -> None:
+    recording = open_recording(small)
+    refuses("store of contact_sheet must be a PriorStore, got 'priors'", contact_sheet, "priors", recording, "a.png")
+    refuses("recording of select_frames must be a Recording, got 'room'", select_frames, "room", [0])
 
 
 def test_arguments_become_what_is_declared() -> None:

@@ -66,6 +66,13 @@ def test_a_disk_on_which_nothing_can_be_written_is_told_before_anything_else(wor
         assert "choose a folder that you may write" in ended.refusal
 
 
+def test_a_run_that_cannot_be_written_is_not_scored_first(workplace: Any) -> None:
+    work = workplace.work["eval"]
+    work.anew()
+    ended = workplace.commands.run([*work.words, "--no-images"], Fault(work.folder, FAIL_FROM, 0, errno.EROFS))
+    assert ended.refusal.startswith(f"d2: cannot write {work.output} (Read-only file system): make it writable or ")
+
+
 def test_a_finished_prior_is_used_where_nothing_can_be_written(workplace: Any) -> None:
     priors = workplace.folder / "priors"
     before = contents(priors)

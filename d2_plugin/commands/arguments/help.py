@@ -12,6 +12,7 @@ from d2_plugin.commands.arguments.form import HELP, Form, Section, is_switch, ty
 from d2_plugin.commands.arguments.text import flag_of, item_kind, limits, placeholder, written
 from d2_plugin.errors import unknown_name
 from d2_plugin.settings import Declared
+from d2_plugin.values import counted
 
 COLUMN = 30
 """Where the explanations begin."""
@@ -53,7 +54,7 @@ def _tables(form: Form, sections: dict[str, Section]) -> str:
     lines = ["Tables of settings; they may also stand in a --config file, and flags win:"]
     for name, section in sections.items():
         count = len(section.settings)
-        lines.append(entry(f"{flag_of(name)}.*", f"{section.about} ({count} setting{'' if count == 1 else 's'})"))
+        lines.append(entry(f"{flag_of(name)}.*", f"{section.about} ({counted(count, 'setting')})"))
     foot = f"`{form.command} --help {next(iter(sections))}` shows the settings of one table"
     return "\n".join([*lines, "", f"{foot}, `{form.command} --help-all` all of them."])
 

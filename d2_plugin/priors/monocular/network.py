@@ -24,7 +24,7 @@ from d2_plugin.priors.settings import Preprocessing
 from d2_plugin.reading import parsing
 from d2_plugin.recordings.images import opencv
 from d2_plugin.recordings.recording import MonoKind
-from d2_plugin.values import shown
+from d2_plugin.values import counted, shown
 
 PREPROCESSINGS: tuple[Preprocessing, ...] = get_args(Preprocessing)
 PATCH = 14  # side of a ViT patch: Depth Anything V2 takes sizes that are multiples of it
@@ -65,8 +65,8 @@ class NetworkInput:
             raise D2Error(f"{path} takes {shown(whole)}: export a network whose input is {layout}")
         if views is not None and isinstance(shape[0], int) and shape[0] != views:
             raise D2Error(
-                f"{path} was exported for {shape[0]} views and would be wrong for {views} without saying so: train "
-                f"with {shape[0]} cameras, or export it for {views}"
+                f"{path} was exported for {counted(shape[0], 'view')} and would be wrong for {views} without saying "
+                f"so: train with {counted(shape[0], 'camera')}, or export it for {views}"
             )
         if views is None and isinstance(shape[0], int) and shape[0] > 1:
             raise D2Error(f"{path} takes {shape[0]} images at once: export it with a batch of 1, or of free size")

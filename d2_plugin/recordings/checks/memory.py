@@ -10,6 +10,7 @@ from pathlib import Path
 
 from d2_plugin.errors import D2Error
 from d2_plugin.recordings.recording import Recording
+from d2_plugin.values import counted
 
 BYTES_PER_PIXEL = 110  # of every training camera, at the peak of building its prior or of rendering it
 BYTES_PER_MATCH, MOST_MATCHES = 70, 2_000_000  # of pixels that stereo matches at once, and how many of a camera
@@ -41,7 +42,7 @@ def check_memory(recording: Recording, cameras: Sequence[str]) -> None:
     fits = [scale for scale in SCALES if available is None or needed_bytes(recording, cameras, scale) <= available]
     proposal = f"--downscale {fits[0]}" if fits else "a machine with more memory"
     largest = max((recording.cameras[name] for name in cameras), key=lambda camera: camera.width * camera.height)
-    what = f"{len(cameras)} cameras of {largest.width}x{largest.height} pixels"
+    what = f"images of {counted(len(cameras), 'camera')} of {largest.width}x{largest.height} pixels"
     check_bytes(needed_bytes(recording, cameras), what, f"use {proposal}")
 
 

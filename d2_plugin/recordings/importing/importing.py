@@ -46,7 +46,7 @@ from d2_plugin.recordings.importing.video import VideoFile, decoded_alone, read_
 from d2_plugin.recordings.readers.videos import KIND as VIDEOS
 from d2_plugin.recordings.readers.videos import TABLE
 from d2_plugin.recordings.recording import Exposure, Recording
-from d2_plugin.values import checked_arguments
+from d2_plugin.values import checked_arguments, counted
 
 Report = Callable[[str], None]  # called with a sentence after each step
 
@@ -295,7 +295,7 @@ def _write_images(folder: Path, recording: Recording, suffix: str, report: Repor
             recorded = recording.recorded(name)
             if recorded is not None:
                 write_mask(folder / VALID_FOLDER / f"{name}.png", recorded)
-    report(f"{total} images of {len(recording.cameras)} cameras")
+    report(f"{counted(total, 'image')} of {counted(len(recording.cameras), 'camera')}")
 
 
 def _exposures(folder: Path, recording: Recording, report: Report) -> dict[str, Exposure]:

@@ -22,6 +22,7 @@ from d2_plugin.recordings.cameras.formats.colmap import (
 from d2_plugin.recordings.files import Shot, by_camera, cameras_with_images, common_frames, images_below
 from d2_plugin.recordings.images import image_size
 from d2_plugin.recordings.recording import Recording
+from d2_plugin.values import counted
 
 COLMAP_FPS = 30.0  # frame rate that is assumed, with a note: a COLMAP model says nothing about time
 
@@ -63,7 +64,7 @@ def _shots(model: ColmapModel, files: Iterable[str]) -> tuple[dict[str, ColmapIm
     read = ((name, reading(name)) for name in others if reading)
     further = {name: shot for name, shot in read if shot is not None and shot.camera in poses}
     shots, left_out = shots | further, len(others) - len(further)
-    notes = (f"{left_out} images left out because the COLMAP model has no pose for them",) if left_out else ()
+    notes = (f"{counted(left_out, 'image')} left out: the COLMAP model has no such pose",) if left_out else ()
     if reading is None and len(poses) > 1:
         notes = (*notes, "every image is a camera of its own at one instant: neither names nor poses show frames")
     return poses, shots, notes

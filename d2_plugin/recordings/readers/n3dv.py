@@ -28,6 +28,7 @@ from d2_plugin.recordings.files import (
 from d2_plugin.recordings.images import IMAGE_SUFFIXES, image_size
 from d2_plugin.recordings.importing.video import VideoFrames, read_video, usual_rate
 from d2_plugin.recordings.recording import Recording
+from d2_plugin.values import counted
 
 POSES = "poses_bounds.npy"
 
@@ -86,7 +87,7 @@ def _assigned(
         note = f"{absent} of {RIG_SIZE} cameras are not there and left out: rows are taken by the cameras' numbers"
         return {name: rows[number] for name, number in numbers.items()}, (note,)
     raise D2Error(
-        f"{where} has {len(rows)} rows for {len(listed)} cameras ({', '.join(listed)}): "
+        f"{where} has {counted(len(rows), 'row')} for {counted(len(listed), 'camera')} ({', '.join(listed)}): "
         "rows belong to the cameras in sorted order, so add or remove what does not match"
     )
 

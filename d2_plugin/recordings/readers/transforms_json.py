@@ -20,6 +20,7 @@ from d2_plugin.recordings.cameras.formats.transforms import ListedImage, camera_
 from d2_plugin.recordings.files import Shot, arrange, by_camera, common_frames
 from d2_plugin.recordings.images import IMAGE_SUFFIXES, image_size
 from d2_plugin.recordings.recording import Recording
+from d2_plugin.values import counted
 
 FILES = ("transforms.json", "transforms_train.json", "transforms_val.json", "transforms_test.json")
 """All that are there are read; their images are joined."""
@@ -84,7 +85,7 @@ def _present(entries: dict[str, _Entry], intersect: bool) -> tuple[dict[str, _En
             f"{missing[0].file} is listed in {missing[0].listed_in} but is not there ({len(missing)} of {len(entries)} "
             "images are missing): add the images or remove them from the list"
         )
-    return present, (f"{len(missing)} listed images are missing and left out",) if missing else ()
+    return present, (f"{counted(len(missing), 'listed image')} left out: no such file",) if missing else ()
 
 
 def _shots(entries: dict[str, _Entry], path: Path) -> tuple[dict[str, Shot], float]:

@@ -16,6 +16,7 @@ from d2_plugin.runs.shared import Shared, share, share_points
 from d2_plugin.runs.tables import STUDY_COLUMNS, Table, markdown
 from d2_plugin.runs.training.measured import Work, by_key, measure_missing
 from d2_plugin.runs.verdict import EXPLANATION, estimated, seeds_in_words, verdicts_table
+from d2_plugin.values import counted
 
 MARK = "○"
 """What a published figure carries in a table, where ours carry nothing."""
@@ -63,7 +64,7 @@ def _work(base: RunSettings, backbone: str, preset: Preset, seed: int, output: P
     variant = prior_settings(settings).variant
     settings = replace(settings, priors=str(output / "priors" / variant))
     case = case_name(Path(settings.recording).resolve().name, settings)
-    case += f", {len(settings.frames)} frame{'s' * (len(settings.frames) > 1)}" if settings.frames else ""
+    case += f", {counted(len(settings.frames), 'frame')}" if settings.frames else ""
     shared = Shared(output, variant)
     share_points(settings, output)
     if preset.hooks or guidance is not None:

@@ -18,9 +18,9 @@ from d2_plugin.locks import Busy
 from d2_plugin.progress import progress_bar
 from d2_plugin.runs.rows import TRY, Row, append_rows, make_row, read_rows, rms_error
 from d2_plugin.runs.run import Run
-from d2_plugin.runs.saved import read_metrics
+from d2_plugin.runs.saved import follow_moved, read_metrics
 from d2_plugin.runs.scene import Guidance
-from d2_plugin.runs.settings import RunSettings
+from d2_plugin.runs.settings import PATHS, RunSettings, check
 from d2_plugin.runs.workers import worker_pool
 from d2_plugin.store.files import hash_of
 
@@ -53,16 +53,15 @@ class Work:
         return self.kind, self.method, self.target, fingerprint(self)
 
     def run(self) -> Run:
-        """The run in its folder; refuses a folder of other settings, with one sentence."""
+        """The run in its folder, its files where they lie now; refuses other settings, with one sentence."""
+        follow_moved(self.folder, check(self.settings))
         return Run(self.settings, self.folder, self.guidance)
 
 
 def fingerprint(work: Work) -> str:
     """Hash of everything that decides a run, without folders."""
     table = work.settings.as_table()
-    table |= {
-        name: Path(table[name]).name for name in ("recording", "priors", "mono_onnx", "multiview") if table.get(name)
-    }
+    table |= {name: Path(table[name]).name for name in PATHS if table.get(name)}
     return hash_of(table, None if work.guidance is None else dict(work.guidance.identity()))
 
 

@@ -17,6 +17,7 @@ from d2_plugin.extras import imported
 from d2_plugin.gaussians.moving import LinearMotion
 from d2_plugin.gaussians.slicing import MARGINAL_CUT
 from d2_plugin.gaussians.spherical_harmonics import SH_C0
+from d2_plugin.values import counted
 from d2_plugin.viewing.export.coded import seen_rows
 from d2_plugin.viewing.export.ply import scales_and_rotations
 from d2_plugin.viewing.export.scene import ExportScene
@@ -54,4 +55,4 @@ def write_4dgs(scene: ExportScene, path: Path) -> list[str]:
     content = io.BytesIO()
     package.write(content, gaussians, max(scene.viewed.duration, 1e-6), options=options)
     write(path, content.getvalue())
-    return [*notes, f"{count:,} Gaussians; colours stand still, as they are at each one's mean time"]
+    return [*notes, f"{counted(count, 'Gaussian', ',')}; colours stand still, as they are at each one's mean time"]

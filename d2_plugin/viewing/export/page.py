@@ -22,6 +22,7 @@ from d2_plugin.recordings import Camera
 from d2_plugin.recordings.images import opencv
 from d2_plugin.recordings.selection import spread
 from d2_plugin.runs.drawing import color_scale
+from d2_plugin.values import counted
 from d2_plugin.viewing.export.coded import BLOCK, MARGINAL_REACH, CodedScene, code_keys, code_lines
 from d2_plugin.viewing.export.keys import bake
 from d2_plugin.viewing.export.scene import ExportScene
@@ -68,7 +69,7 @@ def write_page(scenes: Sequence[ExportScene], path: Path) -> list[str]:
         count, size = sum(map(len, images.values())), sum(length for kept in images.values() for _, _, length in kept)
         about.append(f"{count} recorded images of the cameras {', '.join(images)}: {size / 1e6:.1f} MB of the page")
     about += [
-        f"{len(last.viewed.recording.frames)} frames at {last.viewed.recording.fps:g} per second",
+        f"{counted(len(last.viewed.recording.frames), 'frame')} at {last.viewed.recording.fps:g} per second",
         f"made by d2-4dgs {d2_plugin.__version__}; no network is used",
     ]
     header = _header(last) | {"models": models, "recorded": images, "about": about}
@@ -101,7 +102,7 @@ def _recorded(scene: ExportScene, data: bytearray) -> dict[str, list[tuple[float
 
 
 def _about(scene: ExportScene, coded: CodedScene) -> list[str]:
-    keys, lines = coded.keys, [*scene.viewed.note.splitlines(), f"{coded.gaussians:,} Gaussians"]
+    keys, lines = coded.keys, [*scene.viewed.note.splitlines(), counted(coded.gaussians, "Gaussian", ",")]
     if keys is not None:
         lines.append(
             f"a deformation field at {len(keys.times)} key times, straight in between: off by {keys.offset}; "

@@ -20,6 +20,7 @@ from d2_plugin.runs.metrics import psnr
 from d2_plugin.runs.run import Run
 from d2_plugin.runs.saved import OnStep
 from d2_plugin.settings import Downscale, Positional, Range, Settings
+from d2_plugin.values import counted
 from d2_plugin.viewing.checkpoints import is_output_folder, open_viewed
 from d2_plugin.viewing.live.images import Share
 from d2_plugin.viewing.live.server import LOCAL
@@ -142,4 +143,4 @@ def _scores(viewed: ViewedRun) -> Iterator[str | None]:
         shot = Shot(viewed, viewed.view(recording.cameras[name], recording.seconds(frame, name)))
         scores.append(psnr(shot.rendered.color, torch.from_numpy(shot.truth).float() / 255))
         share.spent += time.monotonic() - now
-        yield f"{sum(scores) / len(scores):.2f} dB PSNR, {kind}, last {len(scores)} views"
+        yield f"{sum(scores) / len(scores):.2f} dB PSNR, {kind}, last {counted(len(scores), 'view')}"

@@ -24,7 +24,7 @@ from d2_plugin.errors import D2Error
 from d2_plugin.hooks.reports import Report
 from d2_plugin.plugin import D2Hooks
 from d2_plugin.protocol import View
-from d2_plugin.values import checked_arguments
+from d2_plugin.values import checked_arguments, counted
 from d2_plugin.viewing.camera_paths import Rig
 from d2_plugin.viewing.live.images import Resolution, Share, draw
 from d2_plugin.viewing.live.overlay import Overlay, frustum_size
@@ -204,7 +204,7 @@ class Viewer:
         if self.training is None or self.viewed is None:
             return
         parts = [f"{step} of {self.training.total}" if self.training.total else str(step)]
-        parts += [f"{len(self.viewed.backbone)} Gaussians"] if self.viewed.backbone is not None else []
+        parts += [counted(len(self.viewed.backbone), "Gaussian")] if self.viewed.backbone is not None else []
         parts += [] if loss is None else [f"loss {loss:.4f}"]
         self.training.progress = ", ".join(parts) + (" (paused)" if self.training.paused else "")
 

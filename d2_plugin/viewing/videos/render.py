@@ -13,6 +13,7 @@ from d2_plugin.progress import progress_bar
 from d2_plugin.recordings.checks.memory import check_bytes
 from d2_plugin.recordings.selection import spread
 from d2_plugin.runs.drawing import GAP, Panel, Scale, depth_scale, side_by_side
+from d2_plugin.values import counted
 from d2_plugin.viewing.checkpoints import open_viewed
 from d2_plugin.viewing.panels import KINDS, Shot
 from d2_plugin.viewing.rendering import render_view
@@ -56,7 +57,9 @@ def run(settings: RenderSettings) -> str:
     height, width = image.shape[:2]
     notes = [f"note  {viewed.note}" for viewed in runs if viewed.note]
     seconds = len(plan.stops) / plan.fps
-    summary = f"{path}: {len(plan.stops)} images of {width}x{height}, {plan.fps:g} per second, {seconds:.3g} s"
+    summary = (
+        f"{path}: {counted(len(plan.stops), 'image')} of {width}x{height}, {plan.fps:g} per second, {seconds:.3g} s"
+    )
     if settings.format == "mp4" and (width % 2 or height % 2):
         summary += f"; the file has {width + width % 2}x{height + height % 2}, since H.264 needs even sides"
     return "\n".join([*notes, summary])
