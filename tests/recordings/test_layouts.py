@@ -104,8 +104,9 @@ def test_a_recording_reads_back(layout: str, tmp_path: Path) -> None:
 def test_a_camera_without_images_is_named_and_left_out_only_when_asked(layout: str, tmp_path: Path) -> None:
     path = write_layout(layout, tmp_path / "recording")
     first, last = open_recording(path).cameras
-    for file in [file for file in path.rglob("*.png") if file.match(f"*_{last}.png") or last in str(file)]:
-        if file.relative_to(path).parts[0] not in ("depth", "mono"):
+    for file in list(path.rglob("*.png")):
+        inside = file.relative_to(path)  # the number of pytest's own folder may be a camera's, too
+        if inside.parts[0] not in ("depth", "mono") and (file.match(f"*_{last}.png") or last in str(inside)):
             file.unlink()
     if layout != "enerf":  # whose published files describe more cameras than there are
         refused(path, f"camera {last} of .* has no image")
