@@ -119,7 +119,7 @@ def test_cameras_are_left_out_until_two_and_more_agree_by_much(ahead, asked, mon
     assert trials.choice == ("all" if sum(ahead) > 0 else "stereo")
 
 
-def test_what_one_seed_of_a_pair_hung_before_a_camera_does_not_choose(monkeypatch) -> None:
+def test_a_seed_that_fails_for_one_of_two_cameras_does_not_choose(monkeypatch) -> None:
     """*dome* 05 02, whose two views train .9 dB better on stereo alone: once of two times that had 2 dB less."""
     scores = [0.640, 0.663, 0.560, 0.569, 0.645, 0.577, 0.556, 0.570]
     trial = Told(monkeypatch, (score - GOOD.ssim for score in scores), "ab")

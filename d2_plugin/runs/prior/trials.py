@@ -186,7 +186,7 @@ def leave_out_in_turn(settings: RunSettings, scene: Scene, points: TimedPoints, 
 
 
 def _bests(seen: Mapping[str, Sequence[Likeness]]) -> dict[str, Likeness]:
-    """The better of a camera's seeds: what one of them hung before it is no word on what was believed."""
+    """The better of a camera's seeds: where one of them failed, that is no word on what was believed."""
     return {camera: max(several, key=lambda one: one.value) for camera, several in seen.items()}
 
 
