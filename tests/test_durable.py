@@ -115,7 +115,7 @@ def test_what_killed_writers_left_is_removed_and_nothing_else(tmp_path: Path) ->
     assert {path.name for path in tmp_path.rglob("*")} == {"below", "part", ".hidden", "a.part"}
 
 
-def test_lines_are_added_whole_and_a_line_that_was_cut_off_stays_alone(tmp_path: Path, monkeypatch) -> None:
+def test_lines_are_added_whole_and_a_line_that_was_cut_off_stays_alone(tmp_path: Path) -> None:
     path = tmp_path / "rows.jsonl"
     append(path, "1\n2\n")
     path.write_text("1\n2\n3")

@@ -78,7 +78,7 @@ def test_every_view_of_a_batch_uses_the_trainers_own_render(backbone: str, monke
     assert ours == views
 
 
-def test_renders_of_an_earlier_step_are_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_renders_of_an_earlier_step_are_forgotten() -> None:
     model, view = make_model(), make_views()[0]
     adapter = make_adapter(model)
     model.render(view).color.sum().backward()
@@ -114,9 +114,8 @@ def test_a_change_that_is_told_and_one_that_is_not_spoil_no_count_of_what_the_tr
 
 
 def test_neither_autocast_nor_another_default_device_changes_a_loss_or_an_edit(monkeypatch) -> None:
-    monkeypatch.setattr(
-        "d2_plugin.plugin.check_surroundings", lambda: None
-    )  # it refuses `meta`, which stands for a GPU
+    # It refuses `meta`, which stands for a GPU.
+    monkeypatch.setattr("d2_plugin.plugin.check_surroundings", lambda: None)
     prior = TinyStore().prior("cam0", 0)
 
     def after(context: AbstractContextManager[object]) -> list[torch.Tensor]:

@@ -81,7 +81,7 @@ class TestThreeDGS:
         assert expected.abs().sum() > 0
         torch.testing.assert_close(values["means2D"].grad, expected, atol=1e-5, rtol=1e-4)
 
-    def test_scales_and_rotations_are_the_covariance(self, camera: dict) -> None:
+    def test_scales_and_rotations_are_the_covariance(self) -> None:
         """R S S^T R^T, with the modifier on the scales; a longer quaternion scales the Gaussian, as in CUDA."""
         scales, turned = torch.tensor([[0.1, 0.2, 0.4]]), torch.tensor([[math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)]])
         result = inria.covariances_of(scales, turned, 2.0)

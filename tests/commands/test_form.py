@@ -99,7 +99,6 @@ class TestValues:
             (Work, ["--steps", "1_000"], "steps", 1000),
             (Work, ["--share", "1"], "share", 1.0),
             (Work, ["--no_images"], "no_images", True),
-            (Work, ["--steps", "1", "--steps", "2"], "steps", 2),
             (Unions, ["--stop", "5"], "stop", 5),
             (Unions, ["--stop", "end"], "stop", "end"),
             (Unions, ["--near", "2"], "near", 2.0),

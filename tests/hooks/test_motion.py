@@ -49,8 +49,8 @@ def context_of(adapter: object, store: object, views: list[View], known: list[Vi
     return Context(step, adapter, views, PriorLoader(store), torch.Generator().manual_seed(0), lambda: known[:1], of)
 
 
-def model_far_away(count: int = 1) -> SplatModel:
-    model = make_model(count=count)
+def model_far_away() -> SplatModel:
+    model = make_model(count=1)
     with torch.no_grad():
         model.gaussians["positions"][:, 2] = 50.0
     return model

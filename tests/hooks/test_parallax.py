@@ -30,10 +30,10 @@ def prior_of(view: View) -> DepthPrior:
     return prior._replace(depth=prior.depth.clone())
 
 
-def seen_columns(own: DepthPrior, other: DepthPrior, row: int = 0) -> list[int]:
-    """The columns of the left view that are seen halfway to the right one."""
+def seen_columns(own: DepthPrior, other: DepthPrior) -> list[int]:
+    """The columns of the left view's first row that are seen halfway to the right one."""
     pixels, _ = in_sight(MIDDLE, Side(LEFT, own), Side(RIGHT, other))
-    return [int(pixel) % WIDTH for pixel in pixels if int(pixel) // WIDTH == row]
+    return [int(pixel) for pixel in pixels if pixel < WIDTH]
 
 
 def context_of(adapter: object, views: list[View], store: object | None = None, step: int = 4) -> Context:

@@ -35,11 +35,11 @@ def seen_by(camera: Camera, points: SparsePoints) -> tuple[np.ndarray, np.ndarra
     return *np.floor(pixels[:, :2] / pixels[:, 2:]).astype(int).T, in_camera[:, 2]
 
 
-def depth_errors(recording: Recording, names: list[str], points: SparsePoints, frame: int = 0) -> np.ndarray:
+def depth_errors(recording: Recording, names: list[str], points: SparsePoints) -> np.ndarray:
     """Relative depth error of each point in the camera that agrees best (the others may not see it)."""
     errors = np.full(len(points), np.inf)
     for name in names:
-        camera, depth = recording.cameras[name], recording.depth(name, frame)
+        camera, depth = recording.cameras[name], recording.depth(name, 0)
         column, row, found = seen_by(camera, points)
         inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
         truth = depth[row[inside], column[inside]]

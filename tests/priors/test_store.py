@@ -44,8 +44,8 @@ def store(tmp_path: Path) -> PriorStore:
     return made
 
 
-def array_file(store: PriorStore, camera: str = "a", frame: int = 0) -> Path:
-    return store.entries.location(camera, frame)
+def array_file(store: PriorStore, camera: str = "a") -> Path:
+    return store.entries.location(camera, 0)
 
 
 def test_depth_labels_sigma_and_colours_come_back(store: PriorStore) -> None:

@@ -249,10 +249,10 @@ FAR = 12.0
 KINDS: tuple[MonoKind, ...] = ("relative", "metric")
 
 
-def bent_scene(kind: MonoKind, bend: float, measured: float = 4.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(aligned map, anchors, true depth): depth 2 to 12 from left to right, anchors where it is below `measured`."""
+def bent_scene(kind: MonoKind, bend: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(aligned map, anchors, true depth): depth 2 to 12 from left to right, anchors where it is below 4."""
     truth = np.tile(np.geomspace(2, FAR, 160), (90, 1))
-    anchors = np.where(truth < measured, truth, 0).astype(np.float32)
+    anchors = np.where(truth < 4, truth, 0).astype(np.float32)
     prediction = (1 / truth if kind == "relative" else truth) ** (1 + bend)
     fit = align(prediction, anchors, kind=kind, settings=SETTINGS)
     assert fit.accepted

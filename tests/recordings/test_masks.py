@@ -33,9 +33,9 @@ def write_mask(path: Path, mask: np.ndarray) -> None:
     assert cv2.imwrite(str(path), mask)
 
 
-def left_half(value: int = 255) -> np.ndarray:
+def left_half() -> np.ndarray:
     mask = np.zeros((H, W), np.uint8)
-    mask[:, : W // 2] = value
+    mask[:, : W // 2] = 255
     return mask
 
 

@@ -22,8 +22,8 @@ def write_text(folder: Path, cameras: list[str], images: list[str], observations
     (folder / "images.txt").write_text("# Image list\n" + "".join(f"{image}\n{observations}\n" for image in images))
 
 
-def pose_line(identity: int, name: str, camera: int = 1, x: float = 0.0) -> str:
-    return f"{identity} 1 0 0 0 {x} 0 0 {camera} {name}"
+def pose_line(identity: int, name: str, x: float = 0.0) -> str:
+    return f"{identity} 1 0 0 0 {x} 0 0 1 {name}"
 
 
 def two_cameras(path: Path, pattern: str = "{}_{:04d}.png") -> Path:

@@ -4,13 +4,10 @@ from dataclasses import replace
 
 import pytest
 import torch
-from mimics import deformable3d, fudan, spacetime
+from attach.repositories import VARIANTS
 from tiny import BACKBONES, make_adapter, make_model, make_views
 
-from d2_plugin.adapters.deformable3d import Deformable3DAdapter
-from d2_plugin.adapters.fudan import FudanAdapter
 from d2_plugin.adapters.gsplat_dict import GsplatAdapter
-from d2_plugin.adapters.spacetime import SpacetimeAdapter
 from d2_plugin.gaussians.spherical_harmonics import SH_C0
 from d2_plugin.viewing.rendering import MARKED, render_view
 
@@ -34,16 +31,12 @@ def test_a_look_is_the_backbones_own_render(backbone: str, background: bool) -> 
     assert not seen.depth[~solid].any()
 
 
-ADAPTERS = {"fudan": FudanAdapter, "deformable3d": Deformable3DAdapter, "spacetime": SpacetimeAdapter}
-MAKERS = {"fudan": fudan.make, "deformable3d": deformable3d.make, "spacetime": lambda: (spacetime.make()[0], 10)}
-
-
-@pytest.mark.parametrize("name", list(ADAPTERS))
+@pytest.mark.parametrize("name", ["fudan", "deformable3d", "spacetime"])
 def test_the_colours_of_official_trainers_are_those_they_render(name: str) -> None:
-    gaussians, *more = MAKERS[name]()
-    adapter = ADAPTERS[name](gaussians, *more[: name != "fudan"])
-    splats = adapter.slice_at(VIEW)
-    assert torch.allclose(adapter.colors(VIEW, splats), gaussians.rgb[splats.rows].clamp(min=0), atol=1e-6)
+    standing = VARIANTS[name]()
+    splats = standing.adapter.slice_at(VIEW)
+    expected = standing.model.rgb[splats.rows].clamp(min=0)
+    assert torch.allclose(standing.adapter.colors(VIEW, splats), expected, atol=1e-6)
 
 
 def test_harmonics_of_gsplat_depend_on_the_direction() -> None:

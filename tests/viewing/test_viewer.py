@@ -337,7 +337,7 @@ class TestSentences:
         assert {"time", "show", "recorded", "marked"} <= controls
         assert not {"cloud", "pause"} & controls
 
-    def test_a_prior_of_another_recording(self, trained: Path, tmp_path: Path, room: Path) -> None:
+    def test_a_prior_of_another_recording(self, trained: Path, room: Path) -> None:
         found = viewed_at(ViewSettings(trained / "priors", recording=room))
         assert found.train_cameras == ("train0", "train1", "train2")
         assert found.backbone is None

@@ -64,7 +64,7 @@ def test_webcams_with_a_board_are_placed_in_metres(webcams: tuple, tmp_path: Pat
     assert rig_width(found.values()) == pytest.approx(rig_width(truth.values()), rel=0.01)
 
 
-def test_webcams_whose_board_is_hidden_from_one_are_told_so(webcams: tuple, tmp_path: Path, capsys, refused) -> None:
+def test_webcams_whose_board_is_hidden_from_one_are_told_so(webcams: tuple, tmp_path: Path, refused) -> None:
     folder, truth = webcams
     for path in folder.glob("*.avi"):
         (tmp_path / path.name).write_bytes(path.read_bytes())

@@ -61,7 +61,7 @@ D2_FN void put(const Task& t, long long i, const Plane<float>& p) {
 
 // Regions that a candidate may come from: the pixel with the lowest cost is taken. All places are an odd number of steps
 // away, that is of the other colour of the checkerboard. Even regions are strips, odd ones a small V; two to a side.
-constexpr int kFarthest = 23, kMostPlaces = 11;
+constexpr int kMostPlaces = 11;
 D2_FN constexpr int region_size(int region) { return region % 2 ? 7 : kMostPlaces; }
 D2_FN constexpr void region_place(int region, int k, int& dx, int& dy) {
   const int side = region / 2, x = side == 0 ? -1 : side == 1 ? 1 : 0, y = side == 2 ? -1 : side == 3 ? 1 : 0;
