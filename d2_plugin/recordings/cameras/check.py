@@ -18,7 +18,7 @@ import numpy as np
 
 from d2_plugin.errors import D2Error
 from d2_plugin.recordings.cameras.calibrating.features import Features, find_features, match_all
-from d2_plugin.recordings.cameras.camera import field_of_view
+from d2_plugin.recordings.cameras.camera import field_of_view, same_spot
 from d2_plugin.recordings.cameras.epipolar import sampson
 from d2_plugin.recordings.images import opencv
 from d2_plugin.recordings.recording import Camera, Recording
@@ -104,7 +104,8 @@ def _origin(rig: Sequence[Camera]) -> Iterator[str]:
     centres = np.stack([camera.centre for camera in rig])
     width = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
     distance = float(np.linalg.norm(centres, axis=1).min())
-    if len(rig) > 1 and width > 0 and distance > FAR_FROM_ORIGIN * width:
+    apart = any(not same_spot(rig[0], other) for other in rig)
+    if apart and distance > FAR_FROM_ORIGIN * width:
         yield (
             f"the cameras stand {distance:.3g} from the origin and {width:.3g} from their middle: positions lose "
             "digits in float32, so move the origin to the scene"
