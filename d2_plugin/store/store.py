@@ -299,7 +299,12 @@ def other_recording(stored: dict[str, Any], given: dict[str, Any]) -> str | None
     if not shared:
         return "they have no camera in common"
     moved = [name for name in shared if not _same_camera(ours[name], theirs[name])]
-    return f"camera {moved[0]} has another size, lens or pose" if moved else None
+    if not moved:
+        return None
+    here, there = ("x".join(map(str, cameras[moved[0]]["size"])) for cameras in (ours, theirs))
+    if here != there:
+        return f"camera {moved[0]} has {there} pixels there and {here} here"
+    return f"camera {moved[0]} has another lens or pose"
 
 
 def not_of(path: Path, stored: dict[str, Any], given: dict[str, Any], reason: str) -> D2Error:
@@ -307,7 +312,7 @@ def not_of(path: Path, stored: dict[str, Any], given: dict[str, Any], reason: st
     why = f" ({reason})" if reason else ""
     return D2Error(
         f"{path} holds the priors of {stored.get('recording')}, not of {given.get('recording')}{why}: "
-        "choose another output folder"
+        "choose another output folder, or the recording and the --downscale that it was built with"
     )
 
 
