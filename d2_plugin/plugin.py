@@ -112,6 +112,7 @@ class D2Hooks:
             opened = store if store is not None else _open_store(config, self.hooks)
             self.prior = PriorLoader(opened, config.prior_memory_mb, renamed_by, config.believe)
             backbone.on_resize(self._follow)
+            self._warn_of_no_step()
 
     @classmethod
     @checked_arguments
@@ -293,6 +294,15 @@ class D2Hooks:
             for name, hook in self.hooks.items()
             if (hook.config.due_when_retired if name in self.retired else hook.config.due)(now)
         ]
+
+    def _warn_of_no_step(self) -> None:
+        last = None if self.config.iterations is None else schedule_step(self.backbone, self.config.iterations)
+        for name, hook in self.hooks.items():
+            start, stop = hook.config.start, hook.config.stop
+            if stop is not None and 0 < start >= stop:
+                _log.warning("%s has no step: it starts at step %d and stops before step %d", name, start, stop)
+            elif last is not None and start > last:
+                _log.warning("%s has no step: it starts at step %d of a run of %d", name, start, last)
 
     def _name_passed_over(self, step: int) -> None:
         """Warn, once, of an edit that was due between the last `step` and this one: it is not made up for."""

@@ -272,8 +272,9 @@ class PriorStore:
 
 
 _OTHER_NAMES = (
-    "if the images were written by `d2 export-recording`, set `exported` in the configuration to the folder of its "
-    "export.json; else give the adapter a function `key` from a camera object to PriorKey(camera, frame)"
+    "if it was not among the --train-cameras of `d2 priors`, build them with it; if the images were written by "
+    "`d2 export-recording`, set `exported` in the configuration to the folder of its export.json; else give the "
+    "adapter a function `key` from a camera object to PriorKey(camera, frame)"
 )
 
 
