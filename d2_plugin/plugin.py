@@ -96,7 +96,7 @@ class D2Hooks:
         self._finite = FiniteCheck(backbone, config.finite_every)
         self._order, self._used = StepOrder(), threading.Lock()
         self._count = len(backbone)
-        self._warned = self._idle_insert = False
+        self._warned = self._idle_insert = self._passed_over = False
         self._inserting = 0  # the step while the backbone inserts for us, else 0
         self._fresh = torch.zeros(0, dtype=torch.int32, device="cpu")  # 1: the trainer added it since our last step
         self.inserted_at = torch.zeros(self._count, dtype=torch.int32, device="cpu")
@@ -112,6 +112,7 @@ class D2Hooks:
             opened = store if store is not None else _open_store(config, self.hooks)
             self.prior = PriorLoader(opened, config.prior_memory_mb, renamed_by, config.believe)
             backbone.on_resize(self._follow)
+            self._warn_of_no_step()
 
     @classmethod
     @checked_arguments
@@ -267,7 +268,10 @@ class D2Hooks:
         self.inserted_at = state.get("inserted_at", torch.zeros(self._count, dtype=torch.int32)).cpu()
 
     def __reduce__(self) -> NoReturn:
-        raise D2Error("D2Hooks are neither copied nor pickled: attach new ones and give them d2.state_dict()")
+        raise D2Error(
+            "D2Hooks, and a backbone that they listen to, are neither copied nor pickled: attach new ones to a new "
+            "backbone and give them d2.state_dict()"
+        )
 
     def _begin(self, step: int) -> None:
         """Give the backbone the number of the step, and notice changes that nobody reported."""
@@ -279,6 +283,8 @@ class D2Hooks:
     def _due(self, step: int, ends: bool) -> list[tuple[str, Hook]]:
         if not call_optional(self.backbone, "active", step, default=True):
             return []  # in its other stages a trainer may count anew
+        if ends:
+            self._name_passed_over(step)
         self._order.check(step, ends)
         now = schedule_step(self.backbone, step)
         if ends and now == schedule_step(self.backbone, step - 1):
@@ -288,6 +294,31 @@ class D2Hooks:
             for name, hook in self.hooks.items()
             if (hook.config.due_when_retired if name in self.retired else hook.config.due)(now)
         ]
+
+    def _warn_of_no_step(self) -> None:
+        last = None if self.config.iterations is None else schedule_step(self.backbone, self.config.iterations)
+        for name, hook in self.hooks.items():
+            start, stop = hook.config.start, hook.config.stop
+            if stop is not None and 0 < start >= stop:
+                _log.warning("%s has no step: it starts at step %d and stops before step %d", name, start, stop)
+            elif last is not None and start > last:
+                _log.warning("%s has no step: it starts at step %d of a run of %d", name, start, last)
+
+    def _name_passed_over(self, step: int) -> None:
+        """Warn, once, of an edit that was due between the last `step` and this one: it is not made up for."""
+        done = self._order.done
+        numbers = () if done < 0 or self._passed_over else range(max(done + 1, step - 10_000), step)
+        for number in numbers:
+            now = schedule_step(self.backbone, number)
+            due = [n for n, h in self.hooks.items() if n in HOOKS and HOOKS[n].edits_structure and h.config.due(now)]
+            due = [name for name in due if name not in self.retired]
+            if due and now != schedule_step(self.backbone, number - 1):
+                self._passed_over = True
+                _log.warning(
+                    "d2.step got step %d after %d, and %s was due at %d: it is left out. Call d2.step after each step "
+                    "of the optimizer, with numbers that rise by one", step, done, " and ".join(due), number,
+                )  # fmt: skip
+                return
 
     def _context(self, step: int, views: Sequence) -> Context:
         def sample() -> Sequence:

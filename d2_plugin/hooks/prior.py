@@ -297,6 +297,8 @@ class PriorLoader:
             if view.camera not in self._without:
                 self._without.add(view.camera)
                 have = ", ".join(map(str, getattr(self.store, "cameras", ()))) or "unknown"
+                if frames := getattr(self.store, "frames", ()):
+                    have += f" at frames {min(frames)} to {max(frames)}"
                 message = "camera %s has no prior at frame %d and is trained without D2 there; the prior has cameras %s"
                 log.warning(message, view.camera, view.frame, have)
         elif key not in self._checked:

@@ -30,7 +30,7 @@ from d2_plugin.priors.summary import PriorSummary
 from d2_plugin.recordings.recording import Camera, MonoKind, Recording
 from d2_plugin.recordings.selection import select_cameras
 from d2_plugin.store.files import hash_of
-from d2_plugin.store.store import PriorStore, not_of
+from d2_plugin.store.store import PriorStore, not_of, other_recording
 
 __all__ = ["PriorSettings", "PriorSummary", "build_priors"]
 
@@ -284,7 +284,8 @@ def _refuse_other_images(recording: Recording, names: list[str], output: Path) -
     recorded = [(view, record) for view in views if (record := _recorded(store, *view)) is not None]
     compared = recorded[:: max(len(recorded) // COMPARED, 1)]
     if compared and not any(view_digest(recording, *view) == record.get("image") for view, record in compared):
-        raise not_of(output, store.about, describe_recording(recording), "their images differ")
+        given = describe_recording(recording)
+        raise not_of(output, store.about, given, other_recording(store.about, given) or "their images differ")
 
 
 def _recorded(store: PriorStore, name: str, number: int) -> dict[str, Any] | None:

@@ -90,12 +90,6 @@ def _view_pair(ours: _Known, theirs: _Known) -> ViewPair:
     return pair
 
 
-def same_spot(first: Camera, second: Camera) -> bool:
-    """Whether two cameras stand on the same spot, up to rounding: they see no parallax."""
-    baseline = np.linalg.norm(first.centre - second.centre)
-    return bool(baseline <= 1e-9 * np.linalg.norm([first.centre, second.centre]))
-
-
 def pixel_grid(camera: Camera, dtype: type = np.float32) -> tuple[np.ndarray, np.ndarray]:
     """Index coordinates u [1, W] and v [H, 1], to be broadcast."""
     return np.arange(camera.width, dtype=dtype)[None, :], np.arange(camera.height, dtype=dtype)[:, None]

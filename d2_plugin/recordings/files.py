@@ -115,7 +115,8 @@ def cameras_with_images(
         )
     if missing and not may_leave_out:
         raise D2Error(
-            f"camera {', '.join(missing)} of {where} has no image: add its images or choose the cameras to read"
+            f"camera {', '.join(missing)} of {where} has no image ({', '.join(IMAGE_SUFFIXES)}): add its images or "
+            "choose the cameras to read"
         )
     left_out = {"images": missing, "calibration": unknown}
     parts = [f"{what} missing: {', '.join(cameras)}" for what, cameras in left_out.items() if cameras]

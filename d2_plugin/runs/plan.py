@@ -10,11 +10,11 @@ import numpy as np
 
 from d2_plugin.errors import D2Error
 from d2_plugin.priors.depth_on_disk import SensorDepth, find_depth_on_disk
-from d2_plugin.priors.geometry import same_spot
 from d2_plugin.priors.multiview.source import multiview_about
 from d2_plugin.priors.settings import PriorSettings
 from d2_plugin.priors.stereo.settings import NO_MATCHER
 from d2_plugin.recordings import MonoKind, Recording
+from d2_plugin.recordings.cameras.camera import same_spot
 from d2_plugin.recordings.cameras.formats.colmap import find_model, read_points
 from d2_plugin.recordings.checks.exposure import FEWEST, relative_exposures
 from d2_plugin.recordings.selection import spread

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -85,7 +85,8 @@ class Run:
         settings = RunSettings.from_table(table, str(folder / "run.json"))
         if recording is not None:
             settings = check(replace(settings, recording=str(recording)))
-            Scene.open(settings)  # what cannot be is refused before anything is written
+            # What cannot be, and another recording, are refused before anything is written.
+            _refuse_another_recording(folder, Scene.open(settings))
             with only_writer(folder):
                 write_table(folder / "run.json", settings.as_table(), saved.RUN)
         elif not Path(settings.recording).exists():
@@ -284,6 +285,23 @@ class Run:
             keep()
 
 
+def _refuse_another_recording(folder: Path, scene: Scene) -> None:
+    """Refuse a recording whose images are not those that the scores of the run in `folder` were measured with."""
+    known: list[str] = []
+    with suppress(D2Error):  # of a run without scores, or with those of another version, nothing is known
+        known = saved.read_metrics(folder)["images"]
+    if known and known != _digests(scene):
+        raise D2Error(
+            f"{scene.recording.path} is not the recording of {folder}, its images of camera {scene.train_cameras[0]} "
+            "are others: give the place that the same recording was moved to"
+        )
+
+
+def _digests(scene: Scene) -> list[str]:
+    """By which metrics.json knows the images again."""
+    return [view_digest(scene.recording, scene.train_cameras[0], scene.recording.frames[-1])[:8]]
+
+
 def _about(run: Run, trainer: Any) -> dict[str, Any]:
     """What metrics.json says beside the scores: the run, its cost, and the machine."""
     scene = run.scene
@@ -305,7 +323,7 @@ def _about(run: Run, trainer: Any) -> dict[str, Any]:
         "trials": run.trials,
         "plan": scene.plan.as_dict(),
         "recording": scene.recording.name,
-        "images": [view_digest(scene.recording, scene.train_cameras[0], scene.recording.frames[-1])[:8]],
+        "images": _digests(scene),
         "mono_emulated": scene.plan.emulated,
         "notes": list(scene.recording.notes),
         "made": circumstances(),

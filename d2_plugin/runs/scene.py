@@ -11,9 +11,9 @@ from typing import Any, Protocol
 from d2_plugin import registry
 from d2_plugin.errors import D2Error, refuse_unknown
 from d2_plugin.hooks import Hook
-from d2_plugin.priors.geometry import same_spot
 from d2_plugin.priors.settings import PriorSettings
 from d2_plugin.recordings import Recording, open_recording
+from d2_plugin.recordings.cameras.camera import same_spot
 from d2_plugin.recordings.cameras.check import check_background_weight, check_recording
 from d2_plugin.recordings.checks.memory import check_memory
 from d2_plugin.runs.metrics import GAUSSIAN_WINDOW

@@ -272,8 +272,9 @@ class PriorStore:
 
 
 _OTHER_NAMES = (
-    "if the images were written by `d2 export-recording`, set `exported` in the configuration to the folder of its "
-    "export.json; else give the adapter a function `key` from a camera object to PriorKey(camera, frame)"
+    "if it was not among the --train-cameras of `d2 priors`, build them with it; if the images were written by "
+    "`d2 export-recording`, set `exported` in the configuration to the folder of its export.json; else give the "
+    "adapter a function `key` from a camera object to PriorKey(camera, frame)"
 )
 
 
@@ -299,7 +300,12 @@ def other_recording(stored: dict[str, Any], given: dict[str, Any]) -> str | None
     if not shared:
         return "they have no camera in common"
     moved = [name for name in shared if not _same_camera(ours[name], theirs[name])]
-    return f"camera {moved[0]} has another size, lens or pose" if moved else None
+    if not moved:
+        return None
+    here, there = ("x".join(map(str, cameras[moved[0]]["size"])) for cameras in (ours, theirs))
+    if here != there:
+        return f"camera {moved[0]} has {there} pixels there and {here} here"
+    return f"camera {moved[0]} has another lens or pose"
 
 
 def not_of(path: Path, stored: dict[str, Any], given: dict[str, Any], reason: str) -> D2Error:
@@ -307,7 +313,7 @@ def not_of(path: Path, stored: dict[str, Any], given: dict[str, Any], reason: st
     why = f" ({reason})" if reason else ""
     return D2Error(
         f"{path} holds the priors of {stored.get('recording')}, not of {given.get('recording')}{why}: "
-        "choose another output folder"
+        "choose another output folder, or the recording and the --downscale that it was built with"
     )
 
 

@@ -15,6 +15,7 @@ from tiny import ALL_HOOKS, TinyFrames, TinyStore, make_adapter, make_model
 
 from d2_plugin import D2Config, D2Hooks
 from d2_plugin.backbones.trainer import Trainer, TrainSettings
+from d2_plugin.config import DepthLossConfig
 from d2_plugin.hooks import reports
 from d2_plugin.hooks.reports import Report, RunLog
 
@@ -83,6 +84,29 @@ def test_a_camera_without_prior_is_warned_of_once_with_those_that_have_one(caplo
     for camera, line in zip(("cam1", "cam2"), sorted(warned), strict=True):
         assert line.startswith(f"camera {camera} has no prior at frame ")
         assert line.endswith("trained without D2 there; the prior has cameras cam0")
+
+
+def test_a_trainer_that_counts_frames_from_one_is_told_which_frames_the_prior_has(caplog) -> None:
+    class FromNought(TinyStore):
+        cameras, frames = ("cam0", "cam1", "cam2"), [0]
+
+        def prior(self, camera: str, frame: int):
+            return super().prior(camera, frame) if frame in self.frames else None
+
+    logged(D2Config(depth_loss=ALL_HOOKS.depth_loss), FromNought()).run()
+    (line, *_) = [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
+    assert " at frame 1 and is" in line
+    assert line.endswith("the prior has cameras cam0, cam1, cam2 at frames 0 to 0")
+
+
+@pytest.mark.parametrize(("start", "stop", "warned"), [(15, 10, 1), (40, None, 1), (1, 2, 0)])
+def test_a_hook_whose_schedule_has_no_step_is_named(start: int, stop: int | None, warned: int, caplog) -> None:
+    D2Hooks(
+        D2Config(depth_loss=DepthLossConfig(start=start, stop=stop), iterations=30),
+        make_adapter(make_model()),
+        TinyStore(),
+    )
+    assert caplog.text.count("depth_loss has no step: it starts at step") == warned
 
 
 def test_a_loss_at_last_is_that_of_the_last_steps_where_nothing_was_read_in_between() -> None:

@@ -18,6 +18,7 @@ from d2_plugin.extras import imported
 from d2_plugin.recordings import open_recording
 from d2_plugin.recordings.export import folder as folder_layout
 from d2_plugin.recordings.export.folder import save_recording
+from d2_plugin.recordings.images import read_image, write_png
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.store.store import PriorStore
 from d2_plugin.viewing import demo
@@ -90,6 +91,18 @@ def test_a_run_finds_its_recording_where_that_was_moved(finished, recording, tmp
     assert remedy in refused("render", str(run)), "what is no recording was not kept"
     assert evaluated("--recording", str(moved)) == scores
     assert evaluated() == scores
+
+
+def test_another_recording_of_the_same_rig_does_not_take_the_place_of_a_runs_own(
+    finished, recording, tmp_path, refused
+) -> None:
+    run, other = shutil.copytree(finished, tmp_path / "full"), shutil.copytree(recording, tmp_path / "other")
+    for image in (other / "images").glob("*/*.png"):
+        write_png(image, read_image(image)[:, ::-1])
+    kept = {name: (run / name).read_bytes() for name in ("run.json", "metrics.json")}
+    said = refused("eval", str(run), "--no-images", "--recording", str(other))
+    assert f"{other} is not the recording of {run}, its images of camera train0 are others" in said
+    assert {name: (run / name).read_bytes() for name in kept} == kept
 
 
 def test_a_run_in_the_current_folder_has_its_name(finished: Path, tmp_path, answered, monkeypatch) -> None:

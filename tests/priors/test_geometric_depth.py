@@ -15,6 +15,7 @@ from d2_plugin.priors.settings import StereoSettings
 from d2_plugin.priors.stereo.depth_range import depth_bounds
 from d2_plugin.priors.stereo.filtering.filter import GeometricDepth
 from d2_plugin.priors.stereo.geometric_depth import geometric_depth, resampled
+from d2_plugin.recordings.cameras.camera import rigid
 from d2_plugin.recordings.recording import Camera, Recording
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 
@@ -159,6 +160,11 @@ def test_points_behind_the_camera_do_not_count_and_cameras_at_one_point_have_no_
     refuses("stand at one point", depth_bounds, [replace(cameras[0], near_far=None)] * 2)
     turning = [camera_at((0.3, 0.7, -1.1), turn, size=(64, 48)) for turn in (0, 0.15, -0.2)]  # apart by rounding
     refuses("stand at one point", depth_bounds, turning)
+    as_read = [replace(one, T_camera_world=one.T_camera_world.astype(np.float32).astype(float)) for one in turning]
+    refuses("stand at one point", depth_bounds, as_read)  # a calibration of seven digits
+    step = np.array([1e-5, 0, 0])
+    apart = [rigid(one.T_camera_world[:3, :3], one.T_camera_world[:3, 3] - i * step) for i, one in enumerate(turning)]
+    assert depth_bounds([replace(one, T_camera_world=pose) for one, pose in zip(turning, apart)]).near > 0
 
 
 BOUNDS = (2.0, 9.0)

@@ -211,6 +211,8 @@ def moved(recording: Recording) -> Recording:
 def test_another_recording_of_the_same_name_changes_no_byte(recording: Recording, copied: Path, changes: dict) -> None:
     before, other = contents(copied), room(**changes) if changes else moved(recording)
     refuses(r"holds the priors of \S+, not of .*\(.*\): choose another output folder", built, other, copied)
+    if "width" in changes:  # as with another --downscale
+        refuses(r"\(camera train0 has \d+x\d+ pixels there and 48x27 here\): .* --downscale", built, other, copied)
     assert contents(copied) == before
 
 

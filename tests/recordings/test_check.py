@@ -102,6 +102,22 @@ def test_images_of_one_colour_are_named(room: Recording) -> None:
     assert f"camera {name} is of one colour at frame 1: nothing can be learned from that" in notes
 
 
+def test_images_of_ten_or_twelve_bits_in_sixteen_are_named(room: Recording) -> None:
+    name = next(iter(room.cameras))
+    dark = showing(room, {"image": lambda camera, frame: room.image(camera, frame) >> 4 * (frame == 1)})
+    (note,) = (note for note in notes_of(dark) if name in note)
+    assert note.startswith(f"camera {name} is nearly black, at most 16 of 255, at frame 1: white is 255")
+
+
+def test_a_mask_of_zeros_and_ones_is_named(room: Recording) -> None:
+    name = next(iter(room.cameras))
+    inside = np.zeros((H, W), np.float32)
+    inside[40:80, 60:120] = 1
+    masks = {"mask": lambda camera, frame: inside / np.float32(255 if camera == name else 1)}
+    (note,) = notes_of(showing(room, masks))
+    assert note.startswith(f"the foreground mask of camera {name} is nearly black at frame 0, 1: white, 255 of 255")
+
+
 def test_too_little_memory_is_said_before_work_begins(room: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
     large = room
     for name, camera in room.cameras.items():

@@ -266,9 +266,36 @@ def test_what_torch_does_to_every_tensor_is_refused_where_d2_cannot_work_with_it
             call()
 
 
+def test_a_counter_that_jumps_over_an_edit_is_named_once(caplog: pytest.LogCaptureFixture) -> None:
+    """As that of micro steps does, and that of a trainer which counts images."""
+    config = D2Config(densify=DensifyConfig(start=2, stop=40, every=3))
+
+    def after(*steps: int) -> None:
+        caplog.clear()
+        d2 = hooks(config=config)
+        for step in steps:
+            d2.loss(step, VIEWS[0])
+            d2.step(step)
+
+    after(*range(1, 8))
+    after(9, 10, 50)
+    assert "densify was due at 11" in caplog.text
+    after(*range(3, 40, 3))
+    said = "d2.step got step 6 after 3, and densify was due at 5: it is left out. Call d2.step after each step"
+    assert caplog.text.count("it is left out") == 1
+    assert said in caplog.text
+    after(*range(1, 40), 100, 200)
+    assert "left out" not in caplog.text
+
+
 @pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy, pickle.dumps])
 def test_hooks_are_not_copied(copied: Callable) -> None:
     refuses(r"neither copied nor pickled: .* give them d2.state_dict\(\)", copied, hooks())
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, pickle.dumps])
+def test_a_copy_of_a_backbone_with_hooks_says_that_the_backbone_is_meant(copied: Callable) -> None:
+    refuses("and a backbone that they listen to, are neither copied nor pickled", copied, hooks().backbone)
 
 
 def test_two_threads_at_once_are_refused() -> None:

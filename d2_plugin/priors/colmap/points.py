@@ -23,9 +23,9 @@ import numpy as np
 
 from d2_plugin.errors import D2Error
 from d2_plugin.extras import import_pycolmap
-from d2_plugin.priors.geometry import same_spot
 from d2_plugin.reading import said
 from d2_plugin.recordings.cameras.calibrating.features import as_colmap
+from d2_plugin.recordings.cameras.camera import same_spot
 from d2_plugin.recordings.cameras.epipolar import sampson
 from d2_plugin.recordings.recording import Camera, Recording
 

@@ -17,9 +17,10 @@ from typing import ClassVar
 import numpy as np
 
 from d2_plugin.errors import D2Error
-from d2_plugin.priors.geometry import relative_pose, same_spot
+from d2_plugin.priors.geometry import relative_pose
 from d2_plugin.priors.stereo.settings import StereoSettings
 from d2_plugin.reading import read_bytes
+from d2_plugin.recordings.cameras.camera import same_spot
 from d2_plugin.recordings.cameras.formats.colmap import ColmapImage, ColmapModel, read_model
 from d2_plugin.recordings.recording import Camera
 

@@ -8,9 +8,9 @@ from typing import NamedTuple
 import numpy as np
 
 from d2_plugin.errors import D2Error
-from d2_plugin.priors.geometry import check_depth_range, projected, same_spot, seen_by
+from d2_plugin.priors.geometry import check_depth_range, projected, seen_by
 from d2_plugin.priors.stereo.settings import StereoSettings
-from d2_plugin.recordings.cameras.camera import rig_width
+from d2_plugin.recordings.cameras.camera import rig_width, same_spot
 from d2_plugin.recordings.recording import Camera
 
 FEWEST = 100

@@ -94,6 +94,17 @@ def rig_width(cameras: Iterable[Camera | CalibratedCamera]) -> float:
     return float(np.linalg.norm(centres[:, None] - centres, axis=-1).max())
 
 
+def same_spot(first: Camera | CalibratedCamera, second: Camera | CalibratedCamera) -> bool:
+    """Whether two cameras stand on the same spot, up to rounding: they see no parallax.
+
+    How far R is from a rotation tells to how many digits a pose was written: float32 has seven.
+    """
+    rotations = np.stack([camera.T_camera_world[:3, :3] for camera in (first, second)])
+    skewed = float(np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max())
+    baseline = np.linalg.norm(first.centre - second.centre)
+    return bool(baseline <= np.clip(8 * skewed, 1e-9, 1e-6) * np.linalg.norm([first.centre, second.centre]))
+
+
 def focus_of(centres: np.ndarray, forwards: np.ndarray, depth: float | None = None) -> np.ndarray:
     """The point [3] nearest to all optical axes; `depth` before the mean camera where they do not meet in front of all.
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from d2_plugin.errors import D2Error
 from d2_plugin.recordings.cameras.calibrating.features import Features, find_features, match_all
-from d2_plugin.recordings.cameras.camera import field_of_view
+from d2_plugin.recordings.cameras.camera import field_of_view, same_spot
 from d2_plugin.recordings.cameras.epipolar import sampson
 from d2_plugin.recordings.images import opencv
 from d2_plugin.recordings.recording import Camera, Recording
@@ -31,7 +31,10 @@ DEPTHS = np.geomspace(0.05, 1000, 25)
 """Where cameras without declared bounds may see the same thing, in widths of the rig."""
 
 GRID = 12  # pixels across and down that stand for an image
+NEARLY_BLACK = 16  # levels of 255 that 12 bits reach in a PNG of 16, and that masks of 0 and 1 do not
 ONE_COLOUR = 2  # an image whose channels vary by no more levels of 255 than this shows nothing
+NEARLY = f"nearly black, at most {NEARLY_BLACK} of 255,"
+STRETCH = "white is 255, in a PNG of 16 bits 65535, so write numbers of 10 or 12 bits in full range"
 SPARSE = 8  # where every eighth pixel each way varies, the others need not be asked
 
 LOOKED_AT = 1 << 25
@@ -101,7 +104,8 @@ def _origin(rig: Sequence[Camera]) -> Iterator[str]:
     centres = np.stack([camera.centre for camera in rig])
     width = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
     distance = float(np.linalg.norm(centres, axis=1).min())
-    if len(rig) > 1 and width > 0 and distance > FAR_FROM_ORIGIN * width:
+    apart = any(not same_spot(rig[0], other) for other in rig)
+    if apart and distance > FAR_FROM_ORIGIN * width:
         yield (
             f"the cameras stand {distance:.3g} from the origin and {width:.3g} from their middle: positions lose "
             "digits in float32, so move the origin to the scene"
@@ -143,8 +147,11 @@ def _plain(recording: Recording, cameras: Sequence[str]) -> Iterator[str]:
             image = recording.image(name, frame)
             if all(np.ptp(part, axis=(0, 1)).max() <= ONE_COLOUR for part in (image[::SPARSE, ::SPARSE], image)):
                 blank.setdefault("black" if image.max() <= ONE_COLOUR else "of one colour", []).append(frame)
+            elif image.max() <= NEARLY_BLACK:
+                blank.setdefault(NEARLY, []).append(frame)
         for what, frames in blank.items():
-            yield f"camera {name} is {what} at frame {_some(frames)}: nothing can be learned from that"
+            remedy = STRETCH if what == NEARLY else "nothing can be learned from that"
+            yield f"camera {name} is {what} at frame {_some(frames)}: {remedy}"
 
 
 def _some(frames: Sequence[int]) -> str:
@@ -152,7 +159,7 @@ def _some(frames: Sequence[int]) -> str:
 
 
 def _empty_masks(recording: Recording, cameras: Sequence[str], frames: Sequence[int]) -> Iterator[str]:
-    """Foreground masks without any foreground, among the frames that are read, a sentence for each camera.
+    """Foreground masks without foreground, or of 0 and 1, among the frames that are read, a sentence for each camera.
 
     Raises:
         D2Error: a camera of which nothing was recorded, or a mask that cannot be read.
@@ -165,9 +172,13 @@ def _empty_masks(recording: Recording, cameras: Sequence[str], frames: Sequence[
                 f"leave camera {name} out"
             )
         masks = {frame: recording.mask(name, frame) for frame in frames}
-        empty = [frame for frame, mask in masks.items() if mask is not None and not mask.any()]
-        if empty:
-            yield f"the foreground mask of camera {name} is empty at frame {_some(empty)}: white counts as foreground"
+        highest = {frame: float(mask.max()) for frame, mask in masks.items() if mask is not None}
+        empty = [frame for frame, most in highest.items() if most == 0]
+        faint = [frame for frame, most in highest.items() if 0 < most <= NEARLY_BLACK / 255]
+        for what, frames in (("empty", empty), ("nearly black", faint)):
+            if frames:
+                where = f"the foreground mask of camera {name} is {what} at frame {_some(frames)}"
+                yield f"{where}: white, 255 of 255, counts as foreground"
 
 
 def calibration_contradicted(recording: Recording) -> tuple[bool, str]:
