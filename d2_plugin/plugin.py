@@ -299,7 +299,7 @@ class D2Hooks:
         last = None if self.config.iterations is None else schedule_step(self.backbone, self.config.iterations)
         for name, hook in self.hooks.items():
             start, stop = hook.config.start, hook.config.stop
-            if stop is not None and 0 < start >= stop:
+            if stop is not None and start >= stop:
                 _log.warning("%s has no step: it starts at step %d and stops before step %d", name, start, stop)
             elif last is not None and start > last:
                 _log.warning("%s has no step: it starts at step %d of a run of %d", name, start, last)
@@ -307,6 +307,7 @@ class D2Hooks:
     def _name_passed_over(self, step: int) -> None:
         """Warn, once, of an edit that was due between the last `step` and this one: it is not made up for."""
         done = self._order.done
+        # Of a long jump its end is looked at: hooks are due more often than every 10,000 steps.
         numbers = () if done < 0 or self._passed_over else range(max(done + 1, step - 10_000), step)
         for number in numbers:
             now = schedule_step(self.backbone, number)
