@@ -54,7 +54,7 @@ Method = TypeVar("Method", bound=Callable[..., Any])
 
 
 def _by_one_thread(method: Method) -> Method:
-    """Refuse a call while another thread is within one; compute in full precision."""
+    """Refuse a call while another thread is within one; compute in full precision, outside of torch.compile."""
 
     @functools.wraps(method)
     def alone(self: D2Hooks, *given: Any, **named: Any) -> Any:
@@ -68,7 +68,7 @@ def _by_one_thread(method: Method) -> Method:
         finally:
             self._used.release()
 
-    return cast(Method, alone)
+    return cast(Method, getattr(torch, "_disable_dynamo", lambda function: function)(alone))
 
 
 class D2Hooks:

@@ -13,7 +13,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tiny import ALL_HOOKS, HEIGHT, WIDTH, TinyStore, make_adapter, make_model, make_views
+from tiny import ALL_HOOKS, HEIGHT, WIDTH, TinyStore, make_adapter, make_model, make_trainer, make_views
 
 from d2_plugin import hooks
 from d2_plugin.config import DensifyConfig, PruneConfig
@@ -130,6 +130,13 @@ def test_a_schedule_inserts_early_and_leaves_half_of_the_run_to_train(iterations
     assert remove.every >= 10
     assert insert.every >= min(10, iterations / 10)
     assert insert.budget_per_view >= 10 * iterations
+
+
+def test_a_step_inside_torch_compile_is_the_same_step() -> None:
+    trainers = [make_trainer(ALL_HOOKS) for _ in range(2)]
+    compiled = torch.compile(lambda *given: trainers[1].d2.loss(*given), backend="eager")
+    for step, view in enumerate(make_views(), start=1):
+        assert torch.equal(trainers[0].d2.loss(step, view), compiled(step, view))
 
 
 FILE_OF_THE_HOOK = """
