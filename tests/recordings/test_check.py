@@ -86,13 +86,23 @@ def test_a_camera_that_looks_away_is_named(room: Recording) -> None:
     assert f"camera {name} sees nothing that another camera sees: check its R and t" in notes
 
 
-def test_a_rig_far_from_the_origin_is_named(room: Recording) -> None:
-    shifted = room
-    for name, camera in room.cameras.items():
-        T = camera.T_camera_world.copy()
-        T[:3, 3] -= T[:3, :3] @ np.array([5e6, 0, 0])
-        shifted = moved(shifted, name, T_camera_world=T)
-    assert any("positions lose digits in float32" in note for note in notes_of(shifted))
+def test_a_rig_far_from_the_origin_is_named_and_one_whose_places_float32_cannot_hold_refused(room: Recording) -> None:
+    def shifted(by: float) -> Recording:
+        recording = room
+        for name, camera in room.cameras.items():
+            T = camera.T_camera_world.copy()
+            T[:3, 3] -= T[:3, :3] @ np.array([by, 0, 0])
+            recording = moved(recording, name, T_camera_world=T)
+        return recording
+
+    says = "positions lose digits in float32, so move the origin to the scene"
+    assert any(says in note for note in notes_of(shifted(5e4)))
+    refuses(says, notes_of, shifted(4e6))
+    one_spot = {
+        name: replace(camera, T_camera_world=shifted(4e6).cameras["train0"].T_camera_world)
+        for name, camera in room.cameras.items()
+    }
+    refuses(says, notes_of, replace(room, cameras=one_spot))
 
 
 def test_images_of_one_colour_are_named(room: Recording) -> None:

@@ -105,11 +105,15 @@ def _origin(rig: Sequence[Camera]) -> Iterator[str]:
     width = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
     distance = float(np.linalg.norm(centres, axis=1).min())
     apart = any(not same_spot(rig[0], other) for other in rig)
+    apart |= len(rig) > 1 and distance > 10 * FAR_FROM_ORIGIN  # so far away it is digits that make them one spot
     if apart and distance > FAR_FROM_ORIGIN * width:
-        yield (
+        said = (
             f"the cameras stand {distance:.3g} from the origin and {width:.3g} from their middle: positions lose "
             "digits in float32, so move the origin to the scene"
         )
+        if distance > 10 * FAR_FROM_ORIGIN * width:  # a step of float32 is a hundredth of the rig: pixels
+            raise D2Error(said)
+        yield said
 
 
 def _alone(rig: Sequence[Camera]) -> Iterator[str]:
