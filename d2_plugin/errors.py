@@ -36,7 +36,8 @@ def unknown_name(kind: str, name: str, known: Iterable[str]) -> D2Error:
     """The error for a name that is not among `known`, with the nearest one suggested."""
     have = sorted(map(str, known))
     name = name if isinstance(name, str) else repr(name)
-    near = difflib.get_close_matches(name[:LONGEST_NAME], have, n=1)
+    near = [one for one in have if one.zfill(9) == name.zfill(9)]  # 3 for 03
+    near = near or difflib.get_close_matches(name[:LONGEST_NAME], have, n=1)
     hint = f"; did you mean '{near[0]}'?" if near else ""
     asked = " ".join((name if len(name) <= LONGEST_NAME else f"{name[:LONGEST_NAME]} ...").splitlines())
     return D2Error(f"unknown {kind} '{asked}': have {', '.join(have) or 'none'}{hint}")

@@ -217,3 +217,9 @@ def test_an_unknown_name_is_repeated_up_to_a_hundred_letters_on_one_line() -> No
     text = str(unknown_name("setting", "a\nb" + "1" * 5000, ["ab"]))
     assert len(text) < 200
     assert "\n" not in text
+
+
+def test_a_number_without_its_zeros_is_told_the_name_with_them() -> None:
+    names = [f"{number:02}" for number in range(40)]
+    assert str(unknown_name("camera", "0", names)).endswith("did you mean '00'?")
+    assert str(unknown_name("camera", "3", names)).endswith("did you mean '03'?")
