@@ -138,6 +138,8 @@ class TestMistakes:
             (Work, ["--steps", "ten"], "setting --steps must be a whole number, got 'ten'"),
             (Work, ["--frames", "0-8"], "--frames is '0-8': give whole numbers joined by commas, or first:last"),
             (Work, ["--frames", "0:8:0"], "--frames is '0:8:0'"),
+            (Work, ["--frames", "3:0"], "--frames is '3:0': .* with the first at most the last"),
+            (Work, ["--frames", "3:0:-1"], "--frames is '3:0:-1'"),  # which would leave 0 and 1 out
             (Work, ["--frames", ""], "--frames is '': give whole numbers"),
             (Work, ["--prune.edges.width", "0"], "--prune.edges.width must be at least 1 pixel, got 0"),
             (Work, ["--prune.enabled", "perhaps"], "--prune.enabled must be"),

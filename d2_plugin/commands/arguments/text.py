@@ -97,12 +97,12 @@ def _numbers(pieces: Sequence[str], flag: str) -> tuple[int, ...]:
         try:
             first, *last = (int(part) for part in piece.split(":"))
             numbers = range(first, last[0] + 1, *last[1:]) if last else [first]
-            if not 0 < len(numbers) <= MOST_NUMBERS - len(values):
+            if not 0 < len(numbers) <= MOST_NUMBERS - len(values) or (last and last[0] < first):
                 raise ValueError(piece)
             values += numbers
         except (ValueError, TypeError, OverflowError):
             raise D2Error(
-                f"{flag} is '{piece[:80]}': give whole numbers joined by commas, or first:last or first:last:step, "
-                f"{MOST_NUMBERS} numbers at most"
+                f"{flag} is '{piece[:80]}': give whole numbers joined by commas, or first:last or first:last:step with "
+                f"the first at most the last, {MOST_NUMBERS} numbers at most"
             ) from None
     return tuple(values)
