@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import inspect
 import math
+import os
 import types
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass
@@ -115,6 +116,8 @@ def _as_kind(kind: Any, limits: Range, value: Any, name: str) -> Any:
         return tuple(_checked(*_inner(item, limits), one, f"an item of {name}") for one in value)
     if kind in (int, float):
         return _as_number(kind, limits, value, name)
+    if kind in (str, Path) and isinstance(value, (str, Path)) and str(value).startswith("~/"):  # no shell expands it in a file, or behind --flag=
+        value = os.path.expanduser(str(value))
     if kind is str and isinstance(value, Path):
         return str(value)
     if kind is Path and isinstance(value, (str, Path)) and str(value) != "" and "\0" not in str(value):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import json
 import math
+import os
 import pkgutil
 import tomllib
 from collections.abc import Callable, Iterator
@@ -269,6 +270,9 @@ def test_a_file_says_its_version_and_paths_are_its_folders(tmp_path: Path) -> No
     assert D2Config.from_toml(path).prior == str(tmp_path / "maps")
     path.write_text(replace(ALL_HOOKS, prior="/somewhere").to_toml())
     assert D2Config.from_toml(path).prior == "/somewhere"
+    path.write_text('prior = "~/maps"\n[densify]\n')
+    assert D2Config.from_toml(path).prior == os.path.expanduser("~/maps")
+    assert Example(folder="~/a").folder == Path.home() / "a"
     path.write_text("[densify\n")
     refuses("as TOML", D2Config.from_toml, path)
 
