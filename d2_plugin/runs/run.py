@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import time
 from collections.abc import Callable, Iterator
@@ -30,6 +31,8 @@ from d2_plugin.runs.shared import COST
 from d2_plugin.runs.start import FROM_STEREO, TimedPoints, triangulated_points, with_stereo
 from d2_plugin.store.store import PriorStore
 from d2_plugin.values import checked_arguments
+
+_log = logging.getLogger(__name__)
 
 CHECKPOINTS = 10
 """How often a run is saved. One that was cut off continues from its last checkpoint, bitwise."""
@@ -172,6 +175,10 @@ class Run:
             with self._timed("eval"):
                 shown = self.folder / "images" if images else None
                 scores = evaluate_scene(trainer.model, self.scene, self.settings.device, shown)
+            if camera := _changed(self.folder, self.scene):
+                _log.warning(
+                    "images of camera %s were changed since this run was scored: these scores replace others", camera
+                )
             metrics = scores | _about(self, trainer)
             write_table(self.folder / "metrics.json", metrics, saved.METRICS)
         return metrics
@@ -287,24 +294,30 @@ class Run:
 
 def _refuse_another_recording(folder: Path, scene: Scene) -> None:
     """Refuse a recording whose images are not those that the scores of the run in `folder` were measured with."""
-    known: list[str] = []
-    with suppress(D2Error):  # of a run without scores, or with those of another version, nothing is known
-        known = saved.read_metrics(folder)["images"]
-    if known and known != _digests(scene):
+    if camera := _changed(folder, scene):
         raise D2Error(
-            f"{scene.recording.path} is not the recording of {folder}, its images of camera {scene.train_cameras[0]} "
-            "are others: give the place that the same recording was moved to"
+            f"{scene.recording.path} is not the recording of {folder}, its images of camera {camera} are others: give "
+            "the place that the same recording was moved to"
         )
 
 
-def _digests(scene: Scene) -> list[str]:
-    """By which metrics.json knows the images again."""
-    return [view_digest(scene.recording, scene.train_cameras[0], scene.recording.frames[-1])[:8]]
+def _changed(folder: Path, scene: Scene) -> str:
+    """A camera whose images are not those that the scores of the run in `folder` were measured with, or nothing."""
+    known: dict[str, str] = {}
+    with suppress(D2Error):  # of a run without scores, or with those of another version, nothing is known
+        known = saved.read_metrics(folder).get("images_by_camera", {})
+    return next((camera for camera, image in _digests(scene).items() if known.get(camera, image) != image), "")
+
+
+def _digests(scene: Scene) -> dict[str, str]:
+    """By which metrics.json knows the images of the first training camera and of those that are scored again."""
+    recording, cameras = scene.recording, dict.fromkeys((scene.train_cameras[0], *scene.test_cameras))
+    return {camera: view_digest(recording, camera, recording.frames[-1])[:8] for camera in cameras}
 
 
 def _about(run: Run, trainer: Any) -> dict[str, Any]:
     """What metrics.json says beside the scores: the run, its cost, and the machine."""
-    scene = run.scene
+    scene, digests = run.scene, _digests(run.scene)
     return {
         "gaussians": len(trainer.model),
         "iterations": trainer.step,
@@ -323,7 +336,8 @@ def _about(run: Run, trainer: Any) -> dict[str, Any]:
         "trials": run.trials,
         "plan": scene.plan.as_dict(),
         "recording": scene.recording.name,
-        "images": _digests(scene),
+        "images": [digests[scene.train_cameras[0]]],
+        "images_by_camera": digests,
         "mono_emulated": scene.plan.emulated,
         "notes": list(scene.recording.notes),
         "made": circumstances(),

@@ -105,6 +105,19 @@ def test_another_recording_of_the_same_rig_does_not_take_the_place_of_a_runs_own
     assert {name: (run / name).read_bytes() for name in kept} == kept
 
 
+@pytest.mark.parametrize("camera", ["train0", "test0"])
+def test_scores_of_images_that_were_changed_in_place_say_so(
+    finished, recording, tmp_path, answered, caplog, camera
+) -> None:
+    run, place = shutil.copytree(finished, tmp_path / "full"), shutil.copytree(recording, tmp_path / "here")
+    answered("eval", str(run), "--no-images", "--recording", str(place))
+    assert "were changed" not in caplog.text
+    for image in (place / "images" / camera).glob("*.png"):
+        write_png(image, read_image(image)[:, ::-1])
+    answered("eval", str(run), "--no-images")
+    assert f"images of camera {camera} were changed since this run was scored" in caplog.text
+
+
 def test_a_run_in_the_current_folder_has_its_name(finished: Path, tmp_path, answered, monkeypatch) -> None:
     monkeypatch.chdir(shutil.copytree(finished, tmp_path / "full"))
     assert "\n| full | " in answered("eval", ".", "--no-images")
