@@ -116,7 +116,9 @@ def _as_kind(kind: Any, limits: Range, value: Any, name: str) -> Any:
         return tuple(_checked(*_inner(item, limits), one, f"an item of {name}") for one in value)
     if kind in (int, float):
         return _as_number(kind, limits, value, name)
-    if kind in (str, Path) and isinstance(value, (str, Path)) and str(value).startswith("~/"):  # no shell expands it in a file, or behind --flag=
+    if (
+        kind in (str, Path) and isinstance(value, (str, Path)) and str(value).startswith("~/")
+    ):  # no shell expands it in a file, or behind --flag=
         value = os.path.expanduser(str(value))
     if kind is str and isinstance(value, Path):
         return str(value)

@@ -15,6 +15,7 @@ import pytest
 import torch
 from refusals import refuses
 from tiny import ALL_HOOKS, BACKBONES, TinyFrames, TinyStore, make_adapter, make_model, make_trainer, make_views
+from torch import Tensor
 
 from d2_plugin import D2Error, D2Hooks
 from d2_plugin.adapters.yang4d import Yang4DAdapter
@@ -182,6 +183,25 @@ def test_a_prior_of_another_size_is_refused_with_both_values() -> None:
     view = replace(make_views()[0], width=64)
     d2 = D2Hooks(only("depth_loss"), Yang4DAdapter(make_model()), TinyStore())
     refuses("is 32x24 pixels but the view is 64x24", d2.loss, 1, view)
+    d2.loss(1, make_views()[0])  # as a trainer at random scales has it
+    refuses("is 32x24 pixels but the view is 64x24.*or give d2.loss views of the prior's size", d2.loss, 2, view)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [(lambda part: part[None], r"returned \(1, 24, 32\) with"), (Tensor.detach, r"returned \(24, 32\) without")],
+)
+def test_a_render_of_the_trainers_that_cannot_be_supervised_is_refused(change: Callable, says: str) -> None:
+    adapter = make_adapter(make_model())
+    adapter.rendered_depth = lambda view: [change(part) for part in rendered(adapter, view)]
+    d2 = D2Hooks(only("depth_loss"), adapter, TinyStore())
+    refuses(rf"rendered_depth\(\) {says}.* or return None, and D2 renders", d2.loss, 1, make_views()[0])
+
+
+def rendered(adapter: Any, view: View) -> tuple[Tensor, Tensor]:
+    splats = adapter.slice_at(view)
+    render = rasterize(splats, splats.means, view, adapter.settings)
+    return render.depth_sum, render.alpha
 
 
 class TestRetirement:

@@ -14,6 +14,7 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
+from d2_plugin.errors import D2Error
 from d2_plugin.hooks.densify import EPSILON, rendered_depth
 from d2_plugin.hooks.expected import check_device
 from d2_plugin.hooks.hook import Context, Hook, HookConfig
@@ -115,6 +116,15 @@ def depth_and_alpha(context: Context, view: View) -> tuple[Tensor, Tensor]:
     """Differentiable sum of w z and alpha [H, W] of a view: the trainer's own render where it has both, else ours."""
     rendered: tuple[Tensor, Tensor] | None = call_optional(context.backbone, "rendered_depth", view)
     if rendered is not None:
+        size, trains = (view.height, view.width), torch.is_grad_enabled()
+        if any(part.shape != size or part.requires_grad < trains for part in rendered):
+            got = " and ".join(
+                f"{tuple(part.shape)}{' with' if part.requires_grad else ' without'}" for part in rendered
+            )
+            raise D2Error(
+                f"rendered_depth() returned {got} gradients, expected {size} twice, both with: mend the adapter, or "
+                "return None, and D2 renders"
+            )
         return rendered
     splats = context.backbone.slice_at(view)
     check_device(splats, view)

@@ -301,9 +301,17 @@ class PriorLoader:
                     have += f" at frames {min(frames)} to {max(frames)}"
                 message = "camera %s has no prior at frame %d and is trained without D2 there; the prior has cameras %s"
                 log.warning(message, view.camera, view.frame, have)
-        elif key not in self._checked:
-            self._check(view, kept)
-            self._checked.add(key)
+        else:
+            height, width = kept.known.kind.shape
+            if (width, height) != (view.width, view.height):
+                raise D2Error(
+                    f"the prior of camera {view.camera}, frame {view.frame} is {width}x{height} pixels but the view is "
+                    f"{view.width}x{view.height}: build the prior at the resolution that is trained at, or give "
+                    "d2.loss views of the prior's size, whatever crop or scale is trained on"
+                )
+            if key not in self._checked:
+                self._check(view, kept)
+                self._checked.add(key)
         return kept
 
     def _read(self, key: Key) -> Kept | None:
@@ -371,12 +379,6 @@ class PriorLoader:
         return kept if kept.reliability is None else kept._replace(reliability=kept.reliability * kept.support)
 
     def _check(self, view: View, kept: Kept) -> None:
-        height, width = kept.known.kind.shape
-        if (width, height) != (view.width, view.height):
-            raise D2Error(
-                f"the prior of camera {view.camera}, frame {view.frame} is {width}x{height} pixels but the view is "
-                f"{view.width}x{view.height}: build the prior at the resolution that is trained at"
-            )
         describe = getattr(self.store, "camera", None)
         record = describe(view.camera, view.frame) if describe is not None else None
         if record is not None:

@@ -155,10 +155,11 @@ def test_the_hook_adds_the_weighted_mean_of_a_batch() -> None:
     count = 3
     priors = [prior_of(seed, 20, 30) for seed in range(count)]
     renders = [[part.requires_grad_() for part in render_of(20, 30, seed)] for seed in range(count)]
-    backbone = SimpleNamespace(rendered_depth=lambda view: renders[view])
-    prior = SimpleNamespace(known=lambda view: KnownMaps.of(priors[view]) if view < count else None)
+    backbone = SimpleNamespace(rendered_depth=lambda view: renders[view.frame])
+    prior = SimpleNamespace(known=lambda view: KnownMaps.of(priors[view.frame]) if view.frame < count else None)
+    views = [View("a", frame, 0.0, torch.eye(4), torch.eye(3), 30, 20) for frame in range(count + 1)]
     hook = module.DepthLoss(DepthLossConfig(weight=0.7))
-    term = hook.loss(SimpleNamespace(backbone=backbone, prior=prior, views=range(count + 1)))
+    term = hook.loss(SimpleNamespace(backbone=backbone, prior=prior, views=views))
     alone = [loss_and_gradients((z.detach(), a.detach()), prior) for (z, a), prior in zip(renders, priors, strict=True)]
     torch.testing.assert_close(term.detach(), 0.7 * torch.stack([loss for loss, *_ in alone]).mean())
     for render, (_, *slopes) in zip(renders, alone, strict=True):
