@@ -68,8 +68,8 @@ def converted(backbone: Backbone, camera: object) -> View:
 
 def check_view(view: View) -> None:
     """Refuse a view that no image can have; waits for its device, so once per view is enough."""
-    for kind, value, what in ((str, view.camera, "camera"), (int, view.frame, "frame"), (float, view.time, "time")):
-        fitting(kind, value, f"the {what} of a view")
+    for what, kind in {"camera": str, "frame": int, "time": float, "width": int, "height": int}.items():
+        fitting(kind, getattr(view, what), f"the {what} of a view")
     name = f"the view of camera {shown(view.camera)} at frame {shown(view.frame)}"
     K, T = view.K, view.T_camera_world
     for matrix, shape, what in ((K, (3, 3), "K"), (T, (4, 4), "T_camera_world")):

@@ -102,6 +102,7 @@ def test_rounding_in_a_pose_and_a_frame_that_is_a_tensor_are_no_mistake() -> Non
         ({"K": torch.eye(4)}, r"K of the view .* is torch.float32 \(4, 4\), expected a plain tensor \(3, 3\)"),
         ({"T_camera_world": None}, "T_camera_world .* is NoneType, expected a plain tensor"),
         ({"width": 0}, "0x24 pixels, expected at least one"),
+        ({"width": 32.0}, "the width of a view must be a whole number, got 32.0"),
         ({"time": math.nan}, "the time of a view must be"),
         ({"frame": 0.5}, "the frame of a view must be"),
         ({"camera": None}, "the camera of a view must be"),
