@@ -33,6 +33,7 @@ from d2_plugin.hooks.expected import (
     check_step,
     check_surroundings,
     converted,
+    mistake_of,
     small_image,
 )
 from d2_plugin.hooks.finite import FiniteCheck
@@ -381,12 +382,14 @@ class D2Hooks:
         return inserted
 
     def _follow(self, index: Tensor) -> None:
+        host = index.cpu() if isinstance(index, Tensor) else index  # the one wait of an edit's report
+        if mistake := mistake_of("the backbone", host, self._count, len(self.backbone)):
+            raise D2Error(f"{mistake}; `d2_plugin.testing.check_backbone` finds such mistakes in adapters")
         for hook in self.hooks.values():
             hook.follow(index)
-        self._count = len(index)
-        index = index.cpu()
-        self.inserted_at = followed(self.inserted_at, index, self._inserting)
-        self._fresh = followed(self._fresh, index, int(not self._inserting))
+        self._count = len(host)
+        self.inserted_at = followed(self.inserted_at, host, self._inserting)
+        self._fresh = followed(self._fresh, host, int(not self._inserting))
 
     def _check_count(self) -> None:
         """The safety net of the contract: a change of N that nobody reported resets per-Gaussian state."""

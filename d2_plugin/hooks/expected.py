@@ -165,6 +165,18 @@ def check_inserted(added: object, asked: int, grown: int) -> None:
         )
 
 
+def mistake_of(what: str, index: Tensor, was: int, now: int) -> str | None:
+    """What is wrong with one report of a change from `was` to `now` Gaussians, if anything."""
+    if not isinstance(index, Tensor) or index.dtype != torch.int64 or index.ndim != 1:
+        got = f"{index.dtype} {tuple(index.shape)}" if isinstance(index, Tensor) else f"a {type(index).__name__}"
+        return f"{what} reports {got}, expected an index, int64 [N_new]"
+    if len(index) != now:
+        return f"{what} reports an index of {len(index)} rows when there are {now}: report N_new rows, after the change"
+    if ((index < -1) | (index >= was)).any():
+        return f"{what} reports rows outside -1..{was - 1}: row r of the index is where row r was, -1 if new"
+    return None
+
+
 def small_image(backbone: Backbone, camera: object) -> Tensor | None:
     """The colours of the image that a camera shows [3, h, w], averaged over blocks; None where nobody knows them."""
     image = call_optional(backbone, "image", camera)

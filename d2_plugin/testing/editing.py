@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from d2_plugin.gaussians.nearest import nearest
+from d2_plugin.hooks.expected import mistake_of
 from d2_plugin.protocol import Backbone, Points, Splats, View, covariance_matrices
 from d2_plugin.testing.example import Check, Example, some_points, some_rows
 
@@ -52,21 +53,10 @@ def _edited(example: Example, what: str, edit: Callable[[], object]) -> tuple[li
     if not listener.reports and len(backbone) != count:
         return [f"{what} changes {count} Gaussians to {len(backbone)} without a report to on_resize"], torch.empty(0)
     for index, was, now in zip(listener.reports, [count, *listener.counts], listener.counts):
-        if mistake := _mistake(what, index, was, now):
+        if mistake := mistake_of(what, index, was, now):
             return [mistake], index
     index = listener.total(count)
     return list(_unchanged(example, what, before, index)), index
-
-
-def _mistake(what: str, index: Tensor, was: int, now: int) -> str | None:
-    """What is wrong with one report of a change from `was` to `now` Gaussians, if anything."""
-    if index.dtype != torch.int64 or index.ndim != 1:
-        return f"{what} reports {index.dtype} {tuple(index.shape)}, expected an index, int64 [N_new]"
-    if len(index) != now:
-        return f"{what} reports an index of {len(index)} rows when there are {now}: report N_new rows, after the change"
-    if ((index < -1) | (index >= was)).any():
-        return f"{what} reports rows outside -1..{was - 1}: row r of the index is where row r was, -1 if new"
-    return None
 
 
 def _unchanged(example: Example, what: str, before: Splats, index: Tensor, loose: bool = False) -> Iterator[str]:
@@ -153,7 +143,7 @@ def _grow(example: Example) -> Iterator[str]:
     grown = len(example.backbone)
     reports = zip(listener.reports, [count, *listener.counts], listener.counts)
     if listener.reports:
-        mistakes = [mistake for report in reports if (mistake := _mistake(what, *report))]
+        mistakes = [mistake for report in reports if (mistake := mistake_of(what, *report))]
         yield from mistakes or _unchanged(example, what, before, listener.total(count), loose=True)
     elif grown != count:
         yield f"{what} goes from {count} to {grown} without a report to on_resize"

@@ -178,6 +178,20 @@ def test_an_insert_that_adds_nothing_is_named_once(caplog: pytest.LogCaptureFixt
     assert caplog.text.count("insert() of the backbone added none of") == 1
 
 
+@pytest.mark.parametrize("change", [lambda i: i >= 0, Tensor.tolist, lambda i: i[:-1], lambda i: i + 99, Tensor.float])
+def test_a_report_that_is_no_index_is_refused(change: Callable) -> None:
+    adapter = make_adapter(make_model())
+    on_resize = adapter.on_resize
+    adapter.on_resize = lambda listener: on_resize(lambda index: listener(change(index)))
+    mask = torch.arange(len(adapter)) < 3
+    refuses(
+        "the backbone reports .*`d2_plugin.testing.check_backbone`",
+        hooks(adapter=adapter)._remove,
+        1,
+        [("own", Edit(remove=mask))],
+    )
+
+
 @pytest.mark.parametrize("said", [3, None, True])
 def test_an_insert_that_says_another_number_is_refused(said: object) -> None:
     refuses(r"insert\(\) was given .* and returned .*return how many were added", inserting(said).step, 1)
