@@ -58,7 +58,7 @@ class RunSettings(Settings):
     """What is trained, on what, for how long. Two runs with equal settings are the same run."""
 
     recording: Annotated[str, Positional()]
-    """Folder of the recording, or a file that describes it."""
+    """Folder of the recording."""
     train_cameras: tuple[str, ...]
     """Cameras to train with, as the recording names them."""
     backbone: str = "yang4d"
