@@ -18,12 +18,13 @@ from hypothesis import strategies as st
 from refusals import refuses
 
 from d2_plugin.durable import CannotWrite
+from d2_plugin.errors import D2Error
 from d2_plugin.runs.ablation.presets import PRESETS
 from d2_plugin.runs.rows import TRY, Row, make_row
 from d2_plugin.runs.settings import RunSettings
 from d2_plugin.runs.shared import Shared
 from d2_plugin.runs.training import bench as timed
-from d2_plugin.runs.training.measured import Work, fingerprint, follow, measure
+from d2_plugin.runs.training.measured import Work, fingerprint, follow, measure, written
 
 SETTINGS = RunSettings("room", ("a", "b"))
 
@@ -122,6 +123,18 @@ class TestPlan:
 def test_a_full_disk_is_no_result() -> None:
     with measured_at_once():
         refuses("full", measure, Mock(run=Mock(side_effect=CannotWrite("full"))))
+
+
+def test_a_folder_of_another_run_is_no_result() -> None:
+    with measured_at_once():
+        refuses("holds another run", measure, Mock(run=Mock(side_effect=D2Error("it holds another run"))))
+
+
+def test_a_run_without_a_score_says_so(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    with written(tmp_path / "rows.jsonl", "bench", 1) as write:
+        why = {"error": None, "seconds": None, "failed": "no camera was held out", "target": "5 steps"}
+        write(make_row("quality", "room", "full", "5 steps", **why))
+    assert "no score of room, full, 5 steps: no camera was held out" in caplog.text
 
 
 PARENT = """

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import logging
 import queue
 import shutil
 from collections.abc import Callable, Container, Generator, Iterable, Iterator, Mapping, Sequence
@@ -23,6 +24,8 @@ from d2_plugin.runs.scene import Guidance
 from d2_plugin.runs.settings import PATHS, RunSettings, check
 from d2_plugin.runs.workers import worker_pool
 from d2_plugin.store.files import hash_of
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,17 +76,18 @@ def measure(work: Work) -> Row:
 
     torch.set_num_threads(1)
     be_silent()
+    run = work.run()  # a folder of another run ends all: as a row it would count as measured when that is mended
     try:
-        return _row(work, _metrics(work))
+        return _row(work, _metrics(work, run))
     except (Busy, CannotWrite):  # the next call finds it mended: a row would count as measured
         raise
     except D2Error as error:
         return _row(work, None, str(error))
 
 
-def _metrics(work: Work) -> dict[str, Any]:
+def _metrics(work: Work, run: Run) -> dict[str, Any]:
     """The metrics of the run, which is continued where it was cut off."""
-    run, checkpoint = work.run(), work.folder / "checkpoint.pt"
+    checkpoint = work.folder / "checkpoint.pt"
     if (work.folder / "metrics.json").is_file() and (work.kept or not checkpoint.is_file()):
         return read_metrics(work.folder)
     if not (work.folder / "points.npz").is_file():
@@ -201,6 +205,8 @@ def written(path: Path, name: str, total: int, **about: Any) -> Iterator[Callabl
 
         def write(row: Row) -> None:
             append_rows(path, [row | about])
+            if row.get("failed"):
+                _log.warning("no score of %s, %s, %s: %s", *map(row.get, ("case", "method", "setting", "failed")))
             if row["target"] != TRY:  # a run that finds a length is beside the count
                 bar.update(next(done), f"{row['case']}: {row['method']}, {row['setting']}")
 
