@@ -69,7 +69,7 @@ def write_page(scenes: Sequence[ExportScene], path: Path) -> list[str]:
         count, size = sum(map(len, images.values())), sum(length for kept in images.values() for _, _, length in kept)
         about.append(f"{count} recorded images of the cameras {', '.join(images)}: {size / 1e6:.1f} MB of the page")
     about += [
-        f"{counted(len(last.viewed.recording.frames), 'frame')} at {last.viewed.recording.fps:g} per second",
+        f"{counted(len(last.viewed.recording.frames), 'frame')} at {last.viewed.recording.rate:g} per second",
         f"made by d2-4dgs {d2_plugin.__version__}; no network is used",
     ]
     header = _header(last) | {"models": models, "recorded": images, "about": about}

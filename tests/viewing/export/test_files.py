@@ -3,6 +3,7 @@
 import json
 import shutil
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from viewing.export.scenes import DURATION, make_scene, sharp_model, with_harmon
 
 from d2_plugin.gaussians.moving import Harmonics, LinearMotion, MovingGaussians
 from d2_plugin.gaussians.slicing import slice_gaussians
+from d2_plugin.recordings import select_frames
 from d2_plugin.viewing.checkpoints import read_ply
 from d2_plugin.viewing.checkpoints.files import columns
 from d2_plugin.viewing.export import compact
@@ -24,6 +26,7 @@ from d2_plugin.viewing.export.export import Export, run, write_export
 from d2_plugin.viewing.export.keys import STILL, bake, cholesky, morton_order, state_at
 from d2_plugin.viewing.export.page import to_json, write_page
 from d2_plugin.viewing.export.ply import scales_and_rotations, write_ply
+from d2_plugin.viewing.export.scene import export_scene
 
 TIMES = (0.0, 0.13, 0.5)
 
@@ -85,6 +88,13 @@ class TestThePage:
         image = cv2.imdecode(np.frombuffer(pages[0].raw[at : at + length], np.uint8), cv2.IMREAD_COLOR)
         assert np.abs(image.astype(int) - 60).max() <= 2, "what the recording holds there"
         assert any("12 recorded images of the cameras right" in line for line in about)
+
+    def test_of_every_second_frame_the_page_says_their_rate(self, tmp_path: Path) -> None:
+        scene = make_scene(sharp_model("yang4d", 50))
+        whole = scene.viewed.recording
+        viewed = replace(scene.viewed, recording=select_frames(whole, whole.frames[::2]))
+        about = write_page([export_scene(viewed)], tmp_path / "scene.html")
+        assert f"{len(whole.frames) // 2} frames at {whole.fps / 2:g} per second" in about
 
     def test_runs_of_two_recordings_are_not_compared(self, tmp_path: Path) -> None:
         scenes = [make_scene(sharp_model("yang4d", 50), "a", names) for names in (("l", "m", "r"), ("l", "m", "s"))]
