@@ -74,7 +74,11 @@ def test_a_camera_path_of_nerfstudio_is_followed(trained, tmp_path, viewed, rend
     path = tmp_path / "camera_path.json"
     entries = [entry | {"render_time": 0.0}, entry | {"render_time": 1.0}]
     path.write_text(json.dumps({"render_width": 96, "render_height": 54, "fps": 5, "camera_path": entries}))
+    (tmp_path / "png").mkdir()
+    for stale in ("00002.png", "00003.png", "mine.png"):  # of a longer video
+        (tmp_path / "png" / stale).touch()
     run(RenderSettings((trained,), output=tmp_path / "png", path=str(path), format="png"))
+    assert {file.name for file in (tmp_path / "png").iterdir()} == {"00000.png", "00001.png", "mine.png"}
     found = [read_image(tmp_path / "png" / name) for name in ("00000.png", "00001.png")]
     assert psnr(found[0] / 255, rendered("train1", 0)) > 45
     assert psnr(found[1] / 255, rendered("train1", 3)) > 45

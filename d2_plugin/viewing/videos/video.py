@@ -52,6 +52,8 @@ def write_video(path: Path, form: Format, fps: float, quality: int = 18) -> Iter
     if form == "png":
         folder, number = make_folder(path), itertools.count()
         yield lambda image: write_png(folder / f"{next(number):05d}.png", checked_image(image, "an image of a video"))
+        while (left := folder / f"{next(number):05d}.png").is_file():  # of a longer video that stood here
+            left.unlink()
         return
     if path.suffix.lower() != f".{form}":  # a typing error must not replace another kind of file
         raise D2Error(f"a video of format {form} needs a name that ends so, got {path.name}: mend the name or --format")
