@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import functools
+import logging
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,8 @@ from d2_plugin.recordings.recording import Camera, MonoKind, Recording
 from d2_plugin.recordings.selection import select_cameras
 from d2_plugin.store.files import hash_of
 from d2_plugin.store.store import PriorStore, not_of, other_recording
+
+log = logging.getLogger(__name__)
 
 __all__ = ["PriorSettings", "PriorSummary", "build_priors"]
 
@@ -97,6 +100,9 @@ def _build_frame(sources: _Sources, store: PriorStore, number: int) -> Iterator[
     frame = Frame.read(sources.recording, list(sources.cameras), number)
     keys = sources.keys(frame)
     missing = [name for name in keys if not store.is_current(name, number, keys[name])]
+    for name in missing:
+        if (old := _recorded(store, name, number)) is not None and old.get("key") != keys[name]:
+            sources.say_replaced(old, store.path)
     # Cameras that are compared need the maps of all others.
     needed = list(sources.cameras) if missing and sources.compared else missing
     priors = construct(sources.views(frame, needed), sources.cameras, sources.settings, sources.kind) if missing else {}
@@ -124,6 +130,8 @@ class _Sources:
     """Of the monocular maps."""
     notes: list[str]
     """For the user: which sources were taken, and what is left out for lack of one."""
+    replaced: set[str] = field(default_factory=set)
+    """What was said of priors that are replaced."""
 
     @classmethod
     def find(
@@ -189,6 +197,18 @@ class _Sources:
             "camera": describe_camera(self.cameras[name]),
             "image": frame.hashes[name],
         }
+
+    def say_replaced(self, old: Mapping[str, Any], folder: Path) -> None:
+        """Warn, once, that priors are replaced, and by what they differ."""
+        before = old.get("settings", {})
+        other = [name for name, value in asdict(self.wanted).items() if hash_of(value) != hash_of(before.get(name))]
+        why = " and ".join(other) or "images or maps"
+        if why not in self.replaced:
+            self.replaced.add(why)
+            log.warning(
+                "priors in %s that were built with other %s are replaced: to keep them, give those, or another folder",
+                folder, why,
+            )  # fmt: skip
 
     def keys(self, frame: Frame) -> dict[str, str]:
         """Per camera, the hash of everything that its prior depends on."""

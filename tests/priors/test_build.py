@@ -149,23 +149,26 @@ def test_views_are_matched_again_where_a_setting_that_matters_changed(plain, beg
 
 
 @pytest.mark.parametrize("change", [{"uncertainty": False}, {"conflict_sigmas": 0.5, "most_vetoed": 1.0}])
-def test_other_fusion_settings_reuse_the_stereo_cache(plain, begun, monkeypatch, change) -> None:
+def test_other_fusion_settings_reuse_the_stereo_cache(plain, begun, monkeypatch, change, caplog) -> None:
     no_stereo(monkeypatch)
     settings = replace(SETTINGS, agreement=0.0, **change)
     strict = build_priors(plain, NAMES, begun, settings)
+    assert caplog.text.count("are replaced") == 1
+    assert f"that were built with other {' and '.join([*change, 'agreement'])} are replaced" in caplog.text
     loose = build_priors(plain, NAMES, begun, replace(settings, tau_c=0.5, conflict_sigmas=3.0))
     assert loose.built == 6
     assert loose.shares["train0"]["verified"] > strict.shares["train0"]["verified"]
     assert loose.shares["train0"]["mono"] == strict.shares["train0"]["mono"]
 
 
-def test_a_changed_image_rebuilds_its_timestamp_and_no_other(plain: Recording, begun: Path) -> None:
+def test_a_changed_image_rebuilds_its_timestamp_and_no_other(plain: Recording, begun: Path, caplog) -> None:
     def image(camera: str, frame: int) -> np.ndarray:
         image = plain.image(camera, frame)
         return np.minimum(image, 250) + 5 if (camera, frame) == ("train1", 1) else image
 
     summary = build_priors(showing(plain, {"image": image}), NAMES, begun, SETTINGS)
     assert (summary.built, summary.kept) == (3, 3)
+    assert caplog.text.count("built with other images or maps are replaced") == 1
 
 
 def test_a_damaged_prior_is_rebuilt_and_named(plain: Recording, begun: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -177,6 +180,7 @@ def test_a_damaged_prior_is_rebuilt_and_named(plain: Recording, begun: Path, cap
     summary = build_priors(plain, NAMES, begun, SETTINGS)
     assert (summary.built, summary.kept) == (1, 5)
     assert str(file) in caplog.text
+    assert "are replaced" not in caplog.text
     assert contents(begun / "priors") == intact
 
 
@@ -274,7 +278,8 @@ def test_mistakes_are_told_before_anything_is_written(plain: Recording, tmp_path
     wrong = {"unknown camera 'cam7'": ["train0", "cam7"], "name at least one": [], "a duplicate": ["train0"] * 2}
     for message, names in wrong.items():
         refuses(message, build_priors, plain, names, tmp_path / "p", SETTINGS)
-    refuses("declared relative", build_priors, plain, NAMES, tmp_path / "p", replace(SETTINGS, mono_kind="metric"))
+    says, metric = "declared relative: .* correct mono/mono.json", replace(SETTINGS, mono_kind="metric")
+    refuses(says, build_priors, plain, NAMES, tmp_path / "p", metric)
     assert not (tmp_path / "p" / "priors").exists()
 
 

@@ -85,7 +85,7 @@ def mono_source(recording: Recording, settings: PriorSettings, cache: Path) -> M
     elif settings.mono_kind not in (None, recording.mono_kind):
         raise D2Error(
             f"mono_kind = {settings.mono_kind} but the maps of {recording.name} are declared {recording.mono_kind}: "
-            "leave mono_kind out, or correct cameras.json"
+            "leave mono_kind out, or correct mono/mono.json"
         )
     else:
         source = MapsOnDisk(recording, recording.mono_kind)
