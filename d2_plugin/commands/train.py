@@ -45,6 +45,7 @@ def form(words: list[str]) -> Form:
 def run(given: Given) -> str:
     """Train to the end and score; returns the table of scores."""
     from d2_plugin.runs.run import Run
+    from d2_plugin.runs.settings import HOOK_NAMES
     from d2_plugin.runs.tables import metrics_table
     from d2_plugin.store.store import PriorStore
 
@@ -53,7 +54,9 @@ def run(given: Given) -> str:
         PriorStore.described(Path(given.values["priors"]))  # nothing is built under a name that was mistyped
     given = _imported(given, options)
     run = Run(run_settings(given), options.output)
-    show_notes(run.scene.recording.notes)
+    idle = [name for name in given.tables if name in HOOK_NAMES and name not in run.settings.hooks]
+    idle_notes = (f"--{name.replace('_', '-')}.* changes nothing: --hooks leaves {name} out" for name in idle)
+    show_notes((*run.scene.recording.notes, *idle_notes))
     show_plan(run.scene.plan)
     live = None
     if options.view:

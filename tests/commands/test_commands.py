@@ -75,7 +75,7 @@ class TestHelp:
 
 
 class TestTables:
-    def test_flags_stand_over_the_file_and_the_file_over_the_defaults(self, recording: Path, tmp_path: Path) -> None:
+    def test_flags_stand_over_the_file_and_the_file_over_the_defaults(self, recording, tmp_path, capsys) -> None:
         config = tmp_path / "d2.toml"
         config.write_text(
             "[densify]\nbudget_per_view = 7\nopacity = 0.2\n[priors]\ntau_c = 0.05\n[priors.stereo]\nmin_angle = 3.0\n"
@@ -85,6 +85,7 @@ class TestTables:
         words += ["--training.ssim-weight", "0.5"]
         output = tmp_path / "run"
         assert main(["train", *words, "--iterations", "4", "--hooks", "none", "--output", str(output)]) == 0
+        assert "note  --densify.* changes nothing: --hooks leaves densify out" in capsys.readouterr().out
         settings = Run.load(output).settings
         densify = hook_config(replace(settings, hooks=("densify",)), tmp_path).densify
         assert (densify.budget_per_view, densify.opacity) == (500, 0.2)
