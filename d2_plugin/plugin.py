@@ -145,6 +145,11 @@ class D2Hooks:
         elif not isinstance(config, D2Config):
             table = config if iterations is None else {"iterations": iterations, **config}
             config = D2Config.from_dict(table, pace=pace)
+        if iterations is not None and config.iterations not in (None, iterations):
+            said = (
+                "the configuration is of a run of %d steps and the trainer says %d: schedules are those of the former"
+            )
+            _log.warning(said, config.iterations, iterations)
         d2 = cls(config, backbone, store, hooks)
         d2.log.start(backbone, d2.prior, config.iterations or iterations, on_report, writer)
         return d2

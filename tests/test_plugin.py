@@ -179,6 +179,13 @@ def test_a_hook_without_a_prior_says_what_to_set() -> None:
         D2Hooks.from_config({"densify": {}, "prune": {}}, backbone=Yang4DAdapter(make_model()))
 
 
+def test_a_configuration_of_another_length_than_the_trainers_is_named(caplog: pytest.LogCaptureFixture) -> None:
+    for config, said in (({"iterations": 90}, 1), ({"iterations": 30}, 0), ({}, 0), (ALL_HOOKS, 0)):
+        caplog.clear()
+        D2Hooks.from_config(config, make_adapter(make_model()), TinyStore(), iterations=30)
+        assert caplog.text.count("is of a run of 90 steps and the trainer says 30") == said
+
+
 def test_a_prior_of_another_size_is_refused_with_both_values() -> None:
     view = replace(make_views()[0], width=64)
     d2 = D2Hooks(only("depth_loss"), Yang4DAdapter(make_model()), TinyStore())
