@@ -15,7 +15,6 @@ from d2_plugin.commands.arguments.recording import (
     show_plan,
     table_of_config,
 )
-from d2_plugin.errors import D2Error
 from d2_plugin.progress import show
 
 OF_THE_RUN = (
@@ -86,21 +85,9 @@ def _imported(given: Given, options: TrainOptions) -> Given:
 
     videos = Path(given.values["recording"])
     if options.calibration is None:
-        _refuse_videos(videos)
         return given
     chosen = ImportChoices.from_dict(table_of_config(given, "import"), "import")
     folder = Path(f"{os.path.abspath(options.output)}-recording")
     settings = ImportSettings(videos=(videos,), calibration=options.calibration, output=folder, **vars(chosen))
     import_videos(settings, report=show)
     return replace(given, values={**given.values, "recording": str(folder)})
-
-
-def _refuse_videos(path: Path) -> None:
-    from d2_plugin.recordings.importing.video import videos_below
-    from d2_plugin.recordings.layouts import LAYOUTS
-
-    if path.is_dir() and not any(layout.recognised(path) for layout in LAYOUTS.values()) and videos_below(path):
-        raise D2Error(
-            f"{path} holds videos and no calibration that goes with them: give it with --calibration FILE, or let "
-            "`d2 import` find one first"
-        )

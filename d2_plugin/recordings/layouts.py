@@ -10,6 +10,7 @@ from typing import NamedTuple, Optional
 from d2_plugin.errors import D2Error, unknown_name
 from d2_plugin.reading import reaching
 from d2_plugin.recordings.cameras.formats.easymocap import INTRINSICS
+from d2_plugin.recordings.importing.video import videos_below
 from d2_plugin.recordings.readers.colmap import is_colmap, open_colmap
 from d2_plugin.recordings.readers.enerf import open_enerf
 from d2_plugin.recordings.readers.folder import CALIBRATION, is_folder, open_folder
@@ -94,6 +95,11 @@ def _recognised(folder: Path) -> str:
     for name, layout in LAYOUTS.items():
         if layout.recognised(folder):
             return name
+    if videos_below(folder):
+        raise D2Error(
+            f"{folder} holds videos and no calibration that goes with them: make a recording of them with `d2 import`, "
+            "or give `d2 train` the --calibration FILE"
+        )
     missing = [part for part in (CALIBRATION, "images") if not (folder / part).exists()]
     half = f", as it has no {missing[0]}" if len(missing) == 1 else ""
     others = ", ".join(name for name in LAYOUTS if name != "folder")

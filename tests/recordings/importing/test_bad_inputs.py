@@ -202,8 +202,9 @@ def test_timecode_against_sound(room: Recording, tmp_path: Path, refused: Refuse
 
 
 def test_a_folder_of_videos_is_no_recording_yet(given: Filmed, refused: Refused, tmp_path: Path) -> None:
-    words = ["train", str(given.videos), "--train-cameras", "all", "--output", str(tmp_path / "run")]
-    assert "holds videos and no calibration that goes with them: give it with --calibration" in refused(*words)
+    for command, more in (("train", ["--output", str(tmp_path / "run")]), ("plan", [])):
+        said = refused(command, str(given.videos), "--train-cameras", "all", *more)
+        assert "holds videos and no calibration that goes with them: make a recording of them with `d2 import`" in said
 
 
 def test_a_video_that_moved_since_it_was_imported(given: Filmed, tmp_path: Path, refused, monkeypatch) -> None:
