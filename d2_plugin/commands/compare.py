@@ -30,6 +30,16 @@ def run(settings: Comparison) -> str:
     names = [folder.resolve().name for folder in settings.run_folders]
     rows = {n if names.count(n) == 1 else str(f): read_metrics(f) for n, f in zip(names, settings.run_folders)}
     table = metrics_table(rows)
+    hashed = all("images_by_camera" in metrics for metrics in rows.values())
+    scored = [
+        [
+            (view["camera"], view["frame"], hashed and m["images_by_camera"].get(view["camera"]))
+            for view in m["per_view"]
+        ]
+        for m in rows.values()
+    ]
+    if any(views != scored[0] for views in scored):
+        table += "\nnot the same images were scored (recording, cameras, frames, size): such rows do not compare"
     if settings.page is None:
         return table
     from d2_plugin.viewing.export.page import write_page

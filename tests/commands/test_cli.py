@@ -208,6 +208,14 @@ def test_compare_tabulates_what_was_measured_and_keeps_runs_of_one_name_apart(fi
         assert cells["LPIPS"] == "-"
 
 
+def test_compare_says_that_runs_were_not_scored_on_the_same_images(recording, tmp_path, answered) -> None:
+    runs = [tmp_path / name for name in ("whole", "again", "one_frame", "small")]
+    for run, more in zip(runs, ((), ("--seed", "3"), ("--frames", "0"), ("--downscale", "2")), strict=True):
+        assert train(recording, run, "--hooks", "none", "--iterations", "2", *more) == 0
+    for run, said in zip(runs[1:], (False, True, True), strict=True):
+        assert ("such rows do not compare" in answered("compare", str(runs[0]), str(run))) == said
+
+
 def test_plan_names_each_decision_with_its_measurement(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["plan", str(recording), "--train-cameras", CAMERAS]) == 0
     notes, lines = [], []
