@@ -185,7 +185,10 @@ def small_image(backbone: Backbone, camera: object) -> Tensor | None:
 
 def check_colors(view: View, image: Tensor, colors: Tensor) -> None:
     """Warn where a prior's colours [H, W, 3] are not those of the image (`small_image`) that is trained on."""
-    apart = image.cpu() - _blocks(colors.permute(2, 0, 1).float().cpu() / 255)
+    made = _blocks(colors.permute(2, 0, 1).float().cpu() / 255)
+    if image.shape != made.shape:  # with opacity, or cut by the trainer: nothing to compare
+        return
+    apart = image.cpu() - made
     apart = (apart - apart.flatten(1).median(1).values[:, None, None]).abs()
     share = float((apart.amax(0) > OTHER_COLOR).float().mean())
     if share > OTHER_BLOCKS:

@@ -392,3 +392,9 @@ def test_a_prior_of_another_frame_is_named(moved: float, noise: float, gain: flo
         d2.step(1)
         d2.loss(2, camera)
     assert caplog.text.count("does the key name another frame?") == int(warned)
+
+
+@pytest.mark.parametrize("image", [torch.ones(4, 24, 32), torch.ones(3, 12, 16)], ids=["with opacity", "cut"])
+def test_an_image_that_is_not_the_priors_is_not_compared(image: Tensor) -> None:
+    camera = SimpleNamespace(view=VIEWS[0], original_image=image)
+    assert hooks(adapter=Filmed(make_model())).loss(1, camera) > 0
