@@ -159,6 +159,7 @@ def test_images_of_two_sizes_are_refused_when_read(folder: Path) -> None:
         ({"R": [[1.01, 0, 0], [0, 1.01, 0], [0, 0, 1.01]]}, "no rotation"),
         ({"R": [[1, 0], [0, 1]]}, "cannot be understood"),
         ({"width": 0}, "at least one pixel"),
+        ({"k1": 0.1}, r"has distortion as k1, k2 and others: write .*opencv.*\[k1, k2, p1, p2, k3\]"),
         ({"name": "train1"}, "camera train1 twice"),
     ],
 )

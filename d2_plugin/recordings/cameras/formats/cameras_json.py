@@ -41,6 +41,10 @@ def read_camera(entry: Any, path: str, bounds: Table | None = None) -> Calibrate
     K = pinhole(*(field(table, key, NUMBER, where, CORRECT) for key in ("fx", "fy", "cx", "cy")))
     width, height = (field(table, key, int, where, CORRECT) for key in ("width", "height"))
     pose = rigid(numbers(table, "R", (3, 3), where), numbers(table, "t", (3,), where))
+    if any(table.get(name) for name in ("k1", "k2", "k3", "p1", "p2")):
+        raise D2Error(
+            f'{where} has distortion as k1, k2 and others: write "model": "opencv", "distortion": [k1, k2, p1, p2, k3]'
+        )
     model = field(table, "model", str, where, CORRECT, default="pinhole")
     lens = checked_lens(K, model, coefficients(table, "distortion", where), where)
     pair = Optional[tuple[NUMBER, NUMBER]]  # noqa: UP045  at run time, on Python 3.9 too
