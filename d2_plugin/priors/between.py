@@ -1,8 +1,9 @@
 """The instants between: what each training camera would have seen 1, 2 and 3 quarters of the way to its next instant.
 
-Every pixel goes its part of the way, from the earlier instant forwards and from the later one back; fast regions lie in
-front of moving pixels, and those in front of still ones. Where both accounts have colours that differ, motion is not
-known and the pixel counts for nothing. D* comes along where something moves, so that surfaces can be inserted there.
+Every pixel goes its part of the way, from the earlier instant forwards and from the later one back, on a curve where
+flow follows it over the interval beside as well; what flies lies in front of fast regions, those in front of moving
+pixels, and those in front of still ones. Where both accounts have colours that differ, motion is not known and the
+pixel counts for nothing. D* comes along where something moves, so that surfaces can be inserted there.
 
 All of it is made from finished priors, which keep their images, and lies beside them, sealed like them.
 """
@@ -17,25 +18,27 @@ from typing import NamedTuple
 
 import numpy as np
 
+from d2_plugin.priors.flights import Passage, Sight, Viewpoint, common_acceleration, join, link, passages
+from d2_plugin.priors.limbs import limbs
 from d2_plugin.priors.scene_flow import (
+    FINE_WIDTH,
     STILL_INSTANTS,
-    Flight,
     Region,
-    common_acceleration,
     dense_flow,
+    followed,
     foreground,
+    led_region,
     regions,
-    same_region,
     still_image,
 )
-from d2_plugin.protocol import CameraRecord, DepthPrior, Label
+from d2_plugin.protocol import DepthPrior, Label
 from d2_plugin.recordings.images import opencv
 from d2_plugin.recordings.selection import spread
 from d2_plugin.store.files import hash_of
 from d2_plugin.store.maps import FusedPrior, empty_prior
 from d2_plugin.store.store import QUARTERS, PriorStore
 
-VERSION = 4
+VERSION = 5
 """Of what is made from the same priors; raise it when that changes."""
 
 MOVES = 0.6
@@ -46,12 +49,19 @@ CONTRADICTS = 40
 """The two accounts of a pixel contradict each other if a channel differs by more than this."""
 MOST_CHANGED = 0.5
 """Where more of an image changes, it is the light that changes, and nothing is known."""
-LAYERS = (1e-3, 1.0, 30.0)
-"""Weights of still pixels, moving ones and fast regions where they meet: what moves lies in front."""
+LAYERS = (1e-3, 1.0, 30.0, 1e3)
+"""Weights of still pixels, moving ones, regions and what flies where they meet: what moves lies in front."""
+SMOOTH = 2.0
+"""Pixels over which the curvature of flow is averaged, in an image of `FINE_WIDTH`."""
 KEPT = 1 << 28
-"""Bytes of flow that are kept until the regions of all cameras are known; other flow is followed a second time."""
+"""Bytes of flow that are kept until the regions of all cameras are known; other flow is made a second time."""
 EXACT = 0.15
 """Largest sigma of the depth that places a region in the world."""
+SURE = 2
+"""Cameras in which a thing must be found that is looked for where it would have flown."""
+
+
+Pair = tuple[np.ndarray, np.ndarray]
 
 
 def build_between(store: PriorStore, progress: Callable[[int], None] = lambda done: None) -> int:
@@ -72,9 +82,7 @@ def build_between(store: PriorStore, progress: Callable[[int], None] = lambda do
     if all(folder.find_current(camera, first, key) for folder, camera, first in entries):
         return 0
     cameras = [CameraMotion(store, name) for name in store.cameras]
-    even = len({second - first for first, second in pairs}) == 1
-    flights = [flight for camera in cameras for interval in camera.flights for flight in interval if flight is not None]
-    acceleration = common_acceleration(flights) if even else None
+    acceleration = follow(cameras) if cameras[0].even else None
     done = 0
     with store.building():
         while cameras:
@@ -88,27 +96,77 @@ def build_between(store: PriorStore, progress: Callable[[int], None] = lambda do
     return done
 
 
+def follow(cameras: Sequence[CameraMotion]) -> np.ndarray | None:
+    """Find what flies in all cameras of a store with even frames; its acceleration [3], None where nothing falls."""
+    count = len(cameras[0].regions)
+    seen = [
+        [sight._replace(camera=which) for which, camera in enumerate(cameras) for sight in camera.sights[index]]
+        for index in range(count)
+    ]
+    intervals = [passages([camera.viewpoint for camera in cameras], sights) for sights in seen]
+    link(intervals)
+    fall = common_acceleration(intervals)
+    if fall is None:
+        return None
+    flying = [[passage for passage in each if passage.flies(fall)] for each in intervals]
+    for index, each in enumerate(flying):
+        for passage in each:
+            for sight in passage.sights:
+                cameras[sight.camera].flying[index][sight.region] = passage
+            seeing = {sight.camera for sight in passage.sights}
+            for which, camera in enumerate(cameras):
+                if len(seeing) > 1 and which not in seeing and (region := camera.led(index, passage)) is not None:
+                    camera.add(index, region, passage)
+    for step in (1, -1):
+        for index in range(count)[::step]:
+            for passage in flying[index]:
+                if (passage.after if step > 0 else passage.before) is not None or not 0 <= index + step < count:
+                    continue
+                beyond = passage.beyond(step, fall)
+                found = [(camera, region) for camera in cameras if (region := camera.led(index + step, beyond))]
+                if len(found) >= SURE:
+                    join(*(passage, beyond)[::step])
+                    flying[index + step].append(beyond)
+                    for camera, region in found:
+                        camera.add(index + step, region, beyond)
+    return fall
+
+
+class _Interval(NamedTuple):
+    """What one camera saw at both ends of an interval."""
+
+    priors: tuple[DepthPrior, DepthPrior]
+    images: Pair  # [H, W, 3] uint8
+    flows: Pair  # [H, W, 2], to the other end
+    follows: Pair  # bool [H, W], where flow is right
+
+
 class CameraMotion:
     """One camera of a store, and the regions that dense flow loses in each interval."""
 
     def __init__(self, store: PriorStore, name: str) -> None:
         self.store, self.name = store, name
+        self.even = len({b - a for a, b in zip(store.frames, store.frames[1:])}) == 1
         record = store.camera(name, store.frames[0])
         assert record is not None, "a prior of this version describes its camera"
-        self.camera = record
         self._seen = functools.lru_cache(maxsize=4)(self._read)
         self.still = still_image([self._seen(frame)[1] for frame in spread(store.frames, STILL_INSTANTS)])
+        self.viewpoint = Viewpoint(record)
+        self.kept: dict[int, tuple[Pair, Pair]] = {}
         self.regions: list[list[Region]] = []
-        self.kept: dict[int, Sequence[np.ndarray]] = {}
+        self.flying: list[dict[int, Passage]] = []
+        """Of each interval, what flies of its regions, by their number."""
+        self.sights: list[list[Sight]] = []
         for index in range(len(store.frames) - 1):
-            _, (earlier, later), (flow, back) = self._ends(index)
-            self.regions.append(regions(earlier, later, self.still, flow, back))
-        self.flights = [[self._flight(index, region) for region in each] for index, each in enumerate(self.regions)]
-        self._seen.cache_clear()
+            priors, images, flows, follows = self._ends(index)
+            found = regions(*images, self.still, *flows)
+            self.regions.append([*found, *limbs(images, self.still, flows, follows, found)])
+            self.flying.append({})
+            self.sights.append([_sight(number, region, priors) for number, region in enumerate(found) if region.fast])
 
     def underway(self, index: int, acceleration: np.ndarray | None) -> dict[int, FusedPrior]:
         """The view at each quarter of an interval; nothing of it is known where too much of the image changes."""
-        cv2, (priors, images, flows) = opencv("scene flow"), self._ends(index)
+        cv2, (priors, images, flows, _) = opencv("scene flow"), self._ends(index)
         difference = np.maximum.reduce(cv2.split(cv2.absdiff(*images)))
         changed = difference > CHANGED
         if changed.mean() > MOST_CHANGED:
@@ -117,69 +175,118 @@ class CameraMotion:
         for image in images:
             changed |= foreground(image, self.still)
         layers = [(np.hypot(flow[..., 0], flow[..., 1]) > MOVES).astype(np.uint8) for flow in flows]
-        for region in self.regions[index]:
-            layers[0].flat[region.start] = layers[1].flat[region.end] = 2
+        moving = self._moving(index)
+        for region, passage in moving:
+            layers[0].flat[region.start] = layers[1].flat[region.end] = 2 if passage is None else 3
         ends = [_Side(*side, 0.0) for side in zip(priors, images, flows, layers)]
+        curves = self._curves(index)
         maps = changed, difference >= CONTRADICTS, images[0].astype(int) << 8 | images[1]
-        return {quarter: _composed(self._sides(index, ends, acceleration, quarter / 4), *maps) for quarter in QUARTERS}
+        return {
+            quarter: _composed(self._sides(ends, curves, moving, acceleration, quarter / 4), *maps)
+            for quarter in QUARTERS
+        }
 
     def flow(self, index: int) -> np.ndarray:
         """How far each pixel goes from one instant of an interval to the next, [H, W, 2] pixels."""
-        flow = self._ends(index)[2][0].copy()
-        for region in self.regions[index]:
-            flow.reshape(-1, 2)[region.start] = region.shift
+        flow = self._ends(index).flows[0].copy()
+        for region, _ in self._moving(index):
+            flow.reshape(-1, 2)[region.start] = region.way(1.0)[0]
         return flow
 
-    def _sides(self, index: int, ends: Sequence[_Side], acceleration: np.ndarray | None, part: float) -> list[_Side]:
+    def led(self, index: int, passage: Passage) -> Region | None:
+        """The region of something that other cameras see, where the images show it."""
+        pixels, depth = self.viewpoint.pixels(passage.ends)
+        if not (depth > 0).all():
+            return None
+        return led_region(*self._ends(index).images, self.still, pixels, self.viewpoint.focal * passage.radius / depth)
+
+    def add(self, index: int, region: Region, passage: Passage) -> None:
+        """One more region of something that flies."""
+        self.flying[index][len(self.regions[index])] = passage
+        self.regions[index].append(region)
+
+    def _moving(self, index: int) -> list[tuple[Region, Passage | None]]:
+        """The regions of an interval and what flies of them; of others, what flow does not follow or turns."""
+        moving, follows = [], self._ends(index).follows
+        for number, region in enumerate(self.regions[index]):
+            passage = self.flying[index].get(number)
+            if passage is None and region.turn == 0:
+                start, end = (
+                    pixels[~follow.flat[pixels]] for pixels, follow in zip((region.start, region.end), follows)
+                )
+                region = replace(region, start=start, end=end)
+            moving.append((region, passage))
+        return moving
+
+    def _curves(self, index: int) -> list[np.ndarray]:
+        """How much more each pixel of both ends would go in another interval [H, W, 2] pixels, where flow says it."""
+        cv2, here = opencv("scene flow"), self._ends(index)
+        curves = [np.zeros_like(flow) for flow in here.flows]
+        if self.even:
+            for end, beside in ((0, index - 1), (1, index + 1)):
+                if 0 <= beside < len(self.regions):
+                    other, flow = self._ends(beside), here.flows[end]
+                    moves = np.hypot(flow[..., 0], flow[..., 1]) > MOVES
+                    known = moves & here.follows[end] & other.follows[1 - end]
+                    change = (flow + other.flows[1 - end]) * known[..., None]
+                    width = SMOOTH * max(1.0, flow.shape[1] / FINE_WIDTH)
+                    total, share = (
+                        cv2.GaussianBlur(map_, (0, 0), width) for map_ in (change, moves.astype(np.float32))
+                    )
+                    curves[end] = total / np.maximum(share, 1e-3)[..., None]
+        return curves
+
+    def _sides(
+        self,
+        ends: Sequence[_Side],
+        curves: Sequence[np.ndarray],
+        moving: Sequence[tuple[Region, Passage | None]],
+        acceleration: np.ndarray | None,
+        part: float,
+    ) -> list[_Side]:
         """Both instants of an interval, their pixels moved to where they are when that part of it has passed."""
-        parts = part, 1 - part
-        moved = [end._replace(steps=share * end.steps, weight=1 - share) for end, share in zip(ends, parts)]
-        for region, flight in zip(self.regions[index], self.flights[index]):
-            bend = 4 * part * (1 - part) * self._bend(flight, acceleration)
-            moved[0].steps.reshape(-1, 2)[region.start] = part * region.shift + bend
-            moved[1].steps.reshape(-1, 2)[region.end] = (1 - part) * -region.shift + bend
+        moved = [
+            end._replace(steps=share * end.steps - part * (1 - part) / 2 * curve, weight=1 - share)
+            for end, share, curve in zip(ends, (part, 1 - part), curves)
+        ]
+        for region, passage in moving:
+            bend = np.zeros(2)
+            if passage is not None and acceleration is not None:
+                (start, end), _ = self.viewpoint.pixels(passage.ends)
+                place, _ = self.viewpoint.pixels(passage.where(part, acceleration))
+                bend = place - (1 - part) * start - part * end
+            for side, pixels, way in zip(moved, (region.start, region.end), region.way(part)):
+                side.steps.reshape(-1, 2)[pixels] = way + bend
         return moved
 
-    def _flight(self, index: int, region: Region) -> Flight | None:
-        """The region's way in the world, with that of the same region in the intervals beside; None without depth."""
-        start, over = self._displacement(index, region)
-        if over is None or start is None or not region.fast:
-            return None
-        before, after = None, None
-        for other in self.regions[index - 1] if index else ():
-            if same_region(other.end, region.start):
-                before = self._displacement(index - 1, other)[1]
-        for other in self.regions[index + 1] if index + 1 < len(self.regions) else ():
-            if same_region(region.end, other.start):
-                after = self._displacement(index + 1, other)[1]
-        return Flight(start, over, before, after)
-
-    def _displacement(self, index: int, region: Region) -> tuple[np.ndarray | None, np.ndarray | None]:
-        """Where a region begins in the world [3], and how far it goes [3]; None where its depth is not known."""
-        ends = zip((region.start, region.end), self.store.frames[index : index + 2])
-        start, end = (_place(pixels, self._seen(frame)[0], self.camera, region.shape) for pixels, frame in ends)
-        return start, None if start is None or end is None else end - start
-
-    def _bend(self, flight: Flight | None, acceleration: np.ndarray | None) -> np.ndarray:
-        """How far the image [2] of a region halfway is from the middle of a straight line."""
-        if flight is None or acceleration is None:
-            return np.zeros(2)
-        middle = flight.start + flight.over / 2
-        return _pixel(middle + flight.bend(acceleration), self.camera) - _pixel(middle, self.camera)
-
-    def _ends(self, index: int) -> tuple[Sequence[DepthPrior], Sequence[np.ndarray], Sequence[np.ndarray]]:
-        """The priors at both ends of an interval, their images, and dense flow from either to the other."""
-        priors, images = zip(*(self._seen(frame) for frame in self.store.frames[index : index + 2]))
-        flows = self.kept.get(index) or (dense_flow(*images), dense_flow(*images[::-1]))
-        if len(self.store.cameras) * (index + 1) * 2 * flows[0].nbytes < KEPT:
-            self.kept[index] = flows
-        return priors, images, flows
+    def _ends(self, index: int) -> _Interval:
+        """What was seen at both ends of an interval."""
+        (prior, image), (next_prior, later) = (self._seen(frame) for frame in self.store.frames[index : index + 2])
+        kept = self.kept.get(index)
+        if kept is None:
+            flow, back = dense_flow(image, later), dense_flow(later, image)
+            kept = (flow, back), (followed(image, later, flow, back), followed(later, image, back, flow))
+            if len(self.store.cameras) * (index + 1) * 2 * flow.nbytes < KEPT:
+                self.kept[index] = kept
+        return _Interval((prior, next_prior), (image, later), *kept)
 
     def _read(self, frame: int) -> tuple[DepthPrior, np.ndarray]:
         prior = self.store.prior(self.name, frame)
         assert prior is not None, "checked before"
         assert prior.colors is not None, "a store keeps them"
         return prior, prior.colors.numpy()
+
+
+def _sight(number: int, region: Region, priors: Sequence[DepthPrior]) -> Sight:
+    """Where a region of an interval is seen at both ends, with the median of its depth there."""
+    ends, depths = [], []
+    for pixels, prior in zip((region.start, region.end), priors):
+        rows, columns = np.unravel_index(pixels, region.shape)
+        depth = prior.depth.numpy()[rows, columns]
+        exact = depth > 0 if prior.sigma is None else (depth > 0) & (prior.sigma.numpy()[rows, columns] < EXACT)
+        ends.append([columns.mean() + 0.5, rows.mean() + 0.5])
+        depths.append(np.median(depth[exact]) if exact.sum() >= 4 else np.nan)
+    return Sight(0, number, np.array(ends), region.radius, np.array(depths))
 
 
 class _Side(NamedTuple):
@@ -203,8 +310,10 @@ def _composed(sides: Sequence[_Side], changed: np.ndarray, unlike: np.ndarray, p
     accounts = [2 * side.weight * account[:, mixed] for side, account in zip(sides, accounts)]
     colors = [account[:3] / np.maximum(account[3], 1e-9) for account in accounts]
     least, differ = np.minimum(accounts[0][3], accounts[1][3]), np.zeros(changed.shape, np.float32)
-    # A region that was found back, and so weighs much, is there whatever its colours: a ball spins.
-    compared = (least > 1e-2 * LAYERS[0]) & (least <= 0.1 * LAYERS[2])
+    # A region that was found back, and so weighs much, is there whatever its colours: a ball spins. What flies is there
+    # as other cameras see it.
+    most = np.maximum(accounts[0][3], accounts[1][3])
+    compared = (least > 1e-2 * LAYERS[0]) & (least <= 0.1 * LAYERS[2]) & (most <= 0.1 * LAYERS[3])
     differ[mixed] = compared & (np.abs(colors[0] - colors[1]).max(0) > CONTRADICTS)
     together = accounts[0] + accounts[1]
     unknown = opencv("scene flow").blur(differ, (3, 3)) > 0.3
@@ -257,22 +366,3 @@ def _origin(sides: Sequence[_Side]) -> np.ndarray:
                 pixels, target = pixels[inside], (row * width + column)[inside]
             origin[target] = index * origin.size + pixels
     return origin.reshape(height, width)
-
-
-def _place(pixels: np.ndarray, prior: DepthPrior, camera: CameraRecord, shape: tuple[int, ...]) -> np.ndarray | None:
-    """The world point [3] at the middle of some pixels (flat indices), at the median of their depth."""
-    rows, columns = np.unravel_index(pixels, shape)
-    depth = prior.depth.numpy()[rows, columns]
-    exact = depth > 0 if prior.sigma is None else (depth > 0) & (prior.sigma.numpy()[rows, columns] < EXACT)
-    if exact.sum() < 4:
-        return None
-    pose = camera.T_camera_world.numpy()
-    ray = np.linalg.solve(camera.K.numpy(), [columns.mean() + 0.5, rows.mean() + 0.5, 1.0])
-    return np.asarray((ray * np.median(depth[exact]) - pose[:3, 3]) @ pose[:3, :3])
-
-
-def _pixel(point: np.ndarray, camera: CameraRecord) -> np.ndarray:
-    """Where a world point [3] is seen, (column, row)."""
-    pose = camera.T_camera_world.numpy()
-    seen = camera.K.numpy() @ (pose[:3, :3] @ point + pose[:3, 3])
-    return np.asarray(seen[:2] / seen[2])

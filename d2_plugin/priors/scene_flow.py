@@ -2,8 +2,8 @@
 
 Dense flow (OpenCV's DIS) follows what moves by a few pixels. A small thing that moves by more than its own size, a
 thrown ball, it does not find: such a region differs from the still background and is not explained by the flow at
-either instant, and it is matched as a whole. Between two instants it goes straight on, unless the regions of all
-cameras and instants, placed in the world by D*, agree on one acceleration: then it falls.
+either instant, and it is matched as a whole (here), as a limb that turns about its joint (`limbs`), or where other
+cameras saw it fly (`flights`).
 """
 
 from __future__ import annotations
@@ -38,12 +38,10 @@ WORST_MATCH, WORST_ALONE = 32.0, 45.0
 """Largest such cost of a match; of one that lands on a thing of its own size. A striped ball that turns costs 40."""
 ALONE = 0.6
 """It does where it covers more than this share of the foreground components that it touches."""
+WORST_LED, LED = 55.0, 0.3
+"""The same of a thing that other cameras see, and how far it may be from where they say it goes, of its radius."""
 FAST = 0.7
 """A region is fast that goes further than this many of its radii."""
-AGREE = 0.35
-"""Two accelerations agree that differ by less than this share of either."""
-FEWEST_AGREEING = 8
-"""Accelerations that must agree before anything falls, and at least three of ten."""
 
 
 def still_image(images: Sequence[np.ndarray]) -> np.ndarray:
@@ -56,7 +54,14 @@ def foreground(image: np.ndarray, still: np.ndarray) -> np.ndarray:
     cv2 = opencv("scene flow")
     differs = (np.maximum.reduce(cv2.split(np.abs(image - still))) > FOREGROUND).astype(np.uint8)
     closed = cv2.morphologyEx(differs, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
-    return np.asarray(cv2.morphologyEx(closed, cv2.MORPH_OPEN, np.ones((2, 2), np.uint8)) > 0)
+    return opened(closed)
+
+
+def opened(mask: np.ndarray) -> np.ndarray:
+    """A mask [H, W] without what is less than two pixels wide."""
+    cv2, square = opencv("scene flow"), np.ones((2, 2), np.uint8)
+    # Its own opening would move it by a pixel, as the square has no middle.
+    return np.asarray(cv2.dilate(cv2.erode(mask.view(np.uint8), square, anchor=(1, 1)), square, anchor=(0, 0)) > 0)
 
 
 def dense_flow(image: np.ndarray, other: np.ndarray) -> np.ndarray:
@@ -89,14 +94,39 @@ class Region:
 
     start: np.ndarray  # int [n], its pixels at the earlier instant, as flat indices
     end: np.ndarray  # int [m], at the later one
-    shift: np.ndarray  # [2] pixels (columns, rows)
+    shift: np.ndarray  # [2] pixels (columns, rows); of the joint, if it turns
     cost: float
     shape: tuple[int, ...]
+    turn: float = 0.0  # radians
+    joint: complex = 0.0  # what it turns about at the earlier instant: column + row i
+
+    @property
+    def radius(self) -> float:
+        """Of a disc as large, pixels."""
+        return math.sqrt(len(self.start) / math.pi)
 
     @property
     def fast(self) -> bool:
-        """Whether it goes further than its own size."""
-        return float(np.hypot(*self.shift)) > FAST * np.sqrt(len(self.start) / np.pi)
+        """Whether all of it goes further than its own size."""
+        return self.turn == 0 and float(np.hypot(*self.shift)) > FAST * self.radius
+
+    def way(self, part: float) -> tuple[np.ndarray, np.ndarray]:
+        """How far each pixel has gone when a part of the time has passed, from the start [n, 2] and the end [m, 2]."""
+        start, end = (_complex(pixels, self.shape) for pixels in (self.start, self.end))
+        began = (end - self.joint - complex(*self.shift)) * np.exp(-1j * self.turn) + self.joint
+        gone = self.path(start, part) - start, self.path(began, part) - end
+        return gone[0].view(float).reshape(-1, 2), gone[1].view(float).reshape(-1, 2)
+
+    def path(self, start: np.ndarray, part: float) -> np.ndarray:
+        """Where points that begin at `start` are when a part of the time has passed; column + row i."""
+        turned = np.exp(1j * self.turn * part) * (start - self.joint)
+        return np.asarray(turned + self.joint + part * complex(*self.shift))
+
+
+def _complex(pixels: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Column + row i of flat indices."""
+    rows, columns = np.unravel_index(pixels, shape)
+    return np.asarray(columns + 1j * rows)
 
 
 def regions(
@@ -115,7 +145,7 @@ def regions(
     for one, other, flows in ((*ends, (flow, back)), (*ends[::-1], (back, flow))):
         for mask in _pieces(one[1], one[1] & ~followed(one[0], other[0], *flows)):
             shift, cost = _match(one, other, mask)
-            landed = (_window(mask.view(np.uint8), -shift, mask.shape[::-1]) > 0) & other[1]
+            landed = _moved(mask, shift) & other[1]
             if np.hypot(*shift) < 3 or np.count_nonzero(landed) <= SMALLEST or cost > _worst_cost(landed, other[1]):
                 continue
             back_again, _ = _match(other, one, landed)
@@ -126,17 +156,45 @@ def regions(
     return sorted(matched, key=lambda region: -region.cost)
 
 
+def led_region(
+    earlier: np.ndarray, later: np.ndarray, still: np.ndarray, ends: np.ndarray, radii: np.ndarray
+) -> Region | None:
+    """A thing of some radii [2] that other cameras see go from one pixel to another, `ends` [2, 2] (columns, rows).
+
+    None where the images do not show it. Where it comes into the image, or leaves it, one end shows it.
+    """
+    rows, columns = np.indices(still.shape[:2]) + 0.5
+    discs = [np.hypot(columns - end[0], rows - end[1]) <= radius for end, radius in zip(ends, radii)]
+    whole = [bool(disc.sum() > max(0.8 * math.pi * radius**2, SMALLEST)) for disc, radius in zip(discs, radii)]
+    fronts = foreground(earlier, still), foreground(later, still)
+    if not any(whole) or any(
+        front[disc].mean() < 0.5 for disc, front, all_of_it in zip(discs, fronts, whole) if all_of_it
+    ):
+        return None
+    shift, cost = ends[1] - ends[0], WORST_LED
+    if all(whole):
+        reach = 2 + round(LED * float(radii[0]))
+        shift, cost = _search(earlier, later, discs[0], fronts[1], np.rint(shift).astype(int), reach)
+        discs[1] = _moved(discs[0], shift)
+    start, end = (np.flatnonzero(disc & front) for disc, front in zip(discs, fronts))
+    return Region(start, end, shift, cost, still.shape[:2]) if cost <= WORST_LED else None
+
+
+def _moved(mask: np.ndarray, shift: np.ndarray) -> np.ndarray:
+    return np.asarray(_window(mask.view(np.uint8), -shift, mask.shape[::-1]) > 0)
+
+
 def _pieces(front: np.ndarray, unexplained: np.ndarray) -> Iterator[np.ndarray]:
     """The masks of what is to be matched: whole foreground components, or the unexplained parts of them."""
     cv2 = opencv("scene flow")
-    unexplained = cv2.morphologyEx(unexplained.view(np.uint8), cv2.MORPH_OPEN, np.ones((2, 2), np.uint8)) > 0
-    for component in _components(front, SMALLEST):
+    unexplained = opened(unexplained)
+    for component in components(front, SMALLEST):
         lost = unexplained & component
         share = np.count_nonzero(lost) / np.count_nonzero(component)
         if share > UNFOLLOWED:
             yield component
         elif share > 0:
-            for part in _components(lost, 20):
+            for part in components(lost, 20):
                 yield (cv2.dilate(part.view(np.uint8), np.ones((5, 5), np.uint8)) > 0) & component
 
 
@@ -147,7 +205,8 @@ def _worst_cost(landed: np.ndarray, front: np.ndarray) -> float:
     return WORST_ALONE if np.count_nonzero(landed) > ALONE * touched else WORST_MATCH
 
 
-def _components(mask: np.ndarray, least: int) -> Iterator[np.ndarray]:
+def components(mask: np.ndarray, least: int) -> Iterator[np.ndarray]:
+    """The connected parts [H, W] of a mask that have so many pixels."""
     count, labels, statistics, _ = opencv("scene flow").connectedComponentsWithStats(mask.view(np.uint8))
     return (labels == index for index in range(1, count) if statistics[index, 4] >= least)
 
@@ -194,53 +253,3 @@ def _window(values: np.ndarray, corner: np.ndarray, size: tuple[int, ...]) -> np
     """The part of an image that begins at (column, row) and has a size (columns, rows); 0 beyond the image."""
     cv2, moving = opencv("scene flow"), np.array([[1, 0, -corner[0]], [0, 1, -corner[1]]], np.float32)
     return np.asarray(cv2.warpAffine(values, moving, size, flags=cv2.INTER_NEAREST))
-
-
-@dataclass(frozen=True, eq=False)
-class Flight:
-    """A fast region with its displacements [3] in the world: over this interval, and over those beside it if known."""
-
-    start: np.ndarray  # [3] world
-    over: np.ndarray
-    before: np.ndarray | None
-    after: np.ndarray | None
-
-    def accelerations(self) -> list[np.ndarray]:
-        """Changes of displacement from interval to interval, [3] each."""
-        changes = [] if self.before is None else [self.over - self.before]
-        return changes if self.after is None else [*changes, self.after - self.over]
-
-    def bend(self, acceleration: np.ndarray) -> np.ndarray:
-        """How far from the middle of the straight line it is halfway, [3].
-
-        Where what came before and what comes after both contradict the acceleration, it hit something in between: both
-        flights are continued into the interval, and the one that has fallen less far is where it is.
-        """
-        own = self.accelerations()
-        gaps = [float(np.linalg.norm(one - acceleration)) for one in own]
-        if not own or min(gaps) <= 0.5 * float(np.linalg.norm(acceleration)):
-            return -acceleration / 8
-        if self.before is None or self.after is None:
-            return -own[0] / 8
-        onwards = 0.5 * (self.before + acceleration) - acceleration / 8
-        backwards = self.over - (0.5 * (self.after - acceleration) + acceleration / 8)
-        halfway = onwards if onwards @ acceleration < backwards @ acceleration else backwards
-        return halfway - self.over / 2
-
-
-def common_acceleration(flights: Sequence[Flight]) -> np.ndarray | None:
-    """The acceleration [3], world units per interval squared, that most flights share; None where they do not."""
-    seen = np.array([change for flight in flights for change in flight.accelerations()]).reshape(-1, 3)
-    if len(seen) < FEWEST_AGREEING:
-        return None
-    lengths = np.linalg.norm(seen, axis=1)
-    # One by one: a long recording has thousands, whose pairs would fill the memory.
-    each = (np.linalg.norm(seen - one, axis=1) < AGREE * length for one, length in zip(seen, lengths))
-    agree = max(each, key=np.count_nonzero)
-    enough = agree.sum() >= max(FEWEST_AGREEING, 0.3 * len(seen))
-    return np.asarray(np.median(seen[agree], axis=0)) if enough else None
-
-
-def same_region(a: np.ndarray, b: np.ndarray) -> bool:
-    """Whether two sets of pixels of one image (flat indices) are mostly the same."""
-    return len(np.intersect1d(a, b)) > 0.5 * max(len(a), len(b))
