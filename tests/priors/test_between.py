@@ -49,12 +49,16 @@ def way(instant: float) -> tuple[float, float]:
     return tuple(FOCAL * position[:2] / BALL_DEPTH + np.array([WIDTH, HEIGHT]) / 2 - 0.5)
 
 
-def thrown(path: Path, count: int, cameras: int = 1, changes: dict[int, np.ndarray] | None = None) -> PriorStore:
-    """Finished priors of cameras in one place; `changes` are other images by frame."""
+def thrown(
+    path: Path, count: int, cameras: int = 1, changes: dict[int, np.ndarray] | None = None, aside: int = 0
+) -> PriorStore:
+    """Finished priors of cameras in one place; `changes` are other images by frame, all of the last is `aside`."""
     store = PriorStore.create(path, [f"cam{index}" for index in range(cameras)], range(count), {"recording": "thrown"})
     camera = {"K": [[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]], "T_camera_world": np.eye(4).tolist()}
     for name, frame in itertools.product(store.cameras, store.frames):
-        mask = ball(*way(frame))
+        left = aside if name == store.cameras[-1] else 0
+        camera["K"][0][2] = WIDTH / 2 - left
+        mask = ball(way(frame)[0] - left, way(frame)[1])
         prior = FusedPrior(
             np.where(mask, BALL_DEPTH, WALL_DEPTH).astype(np.float32),
             np.full((HEIGHT, WIDTH), Label.VERIFIED, np.uint8),
@@ -172,6 +176,16 @@ class TestHalfway:
             assert twice.sum() < 0.1 * around.sum()
             assert np.isclose(depth[inner], BALL_DEPTH, rtol=1e-3).mean() > 0.9
             np.testing.assert_array_equal(depth > 0, np.isin(halfway.labels, (Label.VERIFIED,)))
+
+    def test_a_ball_that_comes_into_an_image_is_where_two_other_cameras_see_it(self, tmp_path: Path) -> None:
+        store = thrown(tmp_path, 5, 3, aside=62)
+        build_between(store)
+        halfway = store.underway("cam2", 0, 3)[1]
+        column, row = way(0.75)
+        inner = ball(column - 62, row, RADIUS - 2)
+        assert inner.sum() > 40
+        assert np.abs(halfway.colors.numpy().astype(int)[inner] - (240, 150, 20)).max() < 20
+        assert (halfway.labels.numpy()[inner] == Label.VERIFIED).all()
 
     def test_what_two_instants_show_turning_is_on_a_curve(self, tmp_path: Path) -> None:
         """A wide thing that speeds up: flow follows it, and its image halfway lies behind the middle."""
