@@ -181,6 +181,7 @@ def led_region(
 
 
 def _moved(mask: np.ndarray, shift: np.ndarray) -> np.ndarray:
+    """A mask [H, W] that went a whole number of pixels."""
     return np.asarray(_window(mask.view(np.uint8), -shift, mask.shape[::-1]) > 0)
 
 
