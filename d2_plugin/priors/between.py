@@ -18,7 +18,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from d2_plugin.priors.flights import Passage, Sight, Viewpoint, common_acceleration, join, link, passages
+from d2_plugin.priors.flights import Observation, Passage, common_acceleration, join, link, passages, pixels_across
+from d2_plugin.priors.geometry import projected
 from d2_plugin.priors.limbs import limbs
 from d2_plugin.priors.scene_flow import (
     FINE_WIDTH,
@@ -33,6 +34,7 @@ from d2_plugin.priors.scene_flow import (
 )
 from d2_plugin.protocol import DepthPrior, Label
 from d2_plugin.recordings.images import opencv
+from d2_plugin.recordings.recording import Camera
 from d2_plugin.recordings.selection import spread
 from d2_plugin.store.files import hash_of
 from d2_plugin.store.maps import FusedPrior, empty_prior
@@ -100,10 +102,14 @@ def follow(cameras: Sequence[CameraMotion]) -> np.ndarray | None:
     """Find what flies in all cameras of a store with even frames; its acceleration [3], None where nothing falls."""
     count = len(cameras[0].regions)
     seen = [
-        [sight._replace(camera=which) for which, camera in enumerate(cameras) for sight in camera.sights[index]]
+        [
+            observation._replace(camera=which)
+            for which, camera in enumerate(cameras)
+            for observation in camera.observations[index]
+        ]
         for index in range(count)
     ]
-    intervals = [passages([camera.viewpoint for camera in cameras], sights) for sights in seen]
+    intervals = [passages([camera.camera for camera in cameras], observations) for observations in seen]
     link(intervals)
     fall = common_acceleration(intervals)
     if fall is None:
@@ -111,9 +117,9 @@ def follow(cameras: Sequence[CameraMotion]) -> np.ndarray | None:
     flying = [[passage for passage in each if passage.flies(fall)] for each in intervals]
     for index, each in enumerate(flying):
         for passage in each:
-            for sight in passage.sights:
-                cameras[sight.camera].flying[index][sight.region] = passage
-            seeing = {sight.camera for sight in passage.sights}
+            for observation in passage.observations:
+                cameras[observation.camera].flying[index][observation.region] = passage
+            seeing = {observation.camera for observation in passage.observations}
             for which, camera in enumerate(cameras):
                 if len(seeing) > 1 and which not in seeing and (region := camera.led(index, passage)) is not None:
                     camera.add(index, region, passage)
@@ -151,18 +157,21 @@ class CameraMotion:
         assert record is not None, "a prior of this version describes its camera"
         self._seen = functools.lru_cache(maxsize=4)(self._read)
         self.still = still_image([self._seen(frame)[1] for frame in spread(store.frames, STILL_INSTANTS)])
-        self.viewpoint = Viewpoint(record)
+        height, width = self.still.shape[:2]
+        self.camera = Camera(name, width, height, record.K.numpy(), record.T_camera_world.numpy())
         self.kept: dict[int, tuple[Pair, Pair]] = {}
         self.regions: list[list[Region]] = []
         self.flying: list[dict[int, Passage]] = []
         """Of each interval, what flies of its regions, by their number."""
-        self.sights: list[list[Sight]] = []
+        self.observations: list[list[Observation]] = []
         for index in range(len(store.frames) - 1):
             priors, images, flows, follows = self._ends(index)
             found = regions(*images, self.still, *flows)
             self.regions.append([*found, *limbs(images, self.still, flows, follows, found)])
             self.flying.append({})
-            self.sights.append([_sight(number, region, priors) for number, region in enumerate(found) if region.fast])
+            self.observations.append(
+                [_observation(number, region, priors) for number, region in enumerate(found) if region.fast]
+            )
 
     def underway(self, index: int, acceleration: np.ndarray | None) -> dict[int, FusedPrior]:
         """The view at each quarter of an interval; nothing of it is known where too much of the image changes."""
@@ -195,10 +204,11 @@ class CameraMotion:
 
     def led(self, index: int, passage: Passage) -> Region | None:
         """The region of something that other cameras see, where the images show it."""
-        pixels, depth = self.viewpoint.pixels(passage.ends)
+        pixels, depth, _ = projected(self.camera, passage.ends)
         if not (depth > 0).all():
             return None
-        return led_region(*self._ends(index).images, self.still, pixels, self.viewpoint.focal * passage.radius / depth)
+        radii = passage.radius * pixels_across(self.camera, passage.ends)
+        return led_region(*self._ends(index).images, self.still, pixels, radii)
 
     def add(self, index: int, region: Region, passage: Passage) -> None:
         """One more region of something that flies."""
@@ -252,8 +262,8 @@ class CameraMotion:
         for region, passage in moving:
             bend = np.zeros(2)
             if passage is not None and acceleration is not None:
-                (start, end), _ = self.viewpoint.pixels(passage.ends)
-                place, _ = self.viewpoint.pixels(passage.where(part, acceleration))
+                way = np.array([*passage.ends, passage.where(part, acceleration)])
+                start, end, place = projected(self.camera, way)[0]
                 bend = place - (1 - part) * start - part * end
             for side, pixels, way in zip(moved, (region.start, region.end), region.way(part)):
                 side.steps.reshape(-1, 2)[pixels] = way + bend
@@ -277,7 +287,7 @@ class CameraMotion:
         return prior, prior.colors.numpy()
 
 
-def _sight(number: int, region: Region, priors: Sequence[DepthPrior]) -> Sight:
+def _observation(number: int, region: Region, priors: Sequence[DepthPrior]) -> Observation:
     """Where a region of an interval is seen at both ends, with the median of its depth there."""
     ends, depths = [], []
     for pixels, prior in zip((region.start, region.end), priors):
@@ -286,7 +296,7 @@ def _sight(number: int, region: Region, priors: Sequence[DepthPrior]) -> Sight:
         exact = depth > 0 if prior.sigma is None else (depth > 0) & (prior.sigma.numpy()[rows, columns] < EXACT)
         ends.append([columns.mean() + 0.5, rows.mean() + 0.5])
         depths.append(np.median(depth[exact]) if exact.sum() >= 4 else np.nan)
-    return Sight(0, number, np.array(ends), region.radius, np.array(depths))
+    return Observation(0, number, np.array(ends), region.radius, np.array(depths))
 
 
 class _Side(NamedTuple):

@@ -15,10 +15,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from d2_plugin.protocol import CameraRecord
+from d2_plugin.priors.geometry import projected
+from d2_plugin.recordings.recording import Camera
 
 NEAR = 0.35
-"""Sights of one thing are seen within so much of its radius from where it is, and ..."""
+"""Observations of one thing are seen within so much of its radius from where it is, and ..."""
 NEAR_PIXELS = 1.5
 """... within so many pixels at least."""
 AGREE = 0.35
@@ -29,31 +30,7 @@ FEWEST_AGREEING = 8
 """Accelerations that must agree before anything falls, and at least three of ten."""
 
 
-class Viewpoint:
-    """A camera of a prior, in numbers."""
-
-    def __init__(self, record: CameraRecord) -> None:
-        self.K, pose = record.K.numpy(), record.T_camera_world.numpy()
-        self.R, self.t = pose[:3, :3], pose[:3, 3]
-        self.place = -self.R.T @ self.t
-        self.focal = float(np.sqrt(self.K[0, 0] * self.K[1, 1]))
-
-    def pixels(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Where world points [..., 3] are seen, (column, row) [..., 2], and their depth [...]."""
-        seen = (points @ self.R.T + self.t) @ self.K.T
-        return seen[..., :2] / np.where(seen[..., 2:] > 1e-9, seen[..., 2:], np.nan), seen[..., 2]
-
-    def size(self, radius: float, point: np.ndarray) -> float:
-        """How large in the world something is at a point that takes so many pixels."""
-        return float(radius * self.pixels(point)[1] / self.focal)
-
-    def rays(self, pixels: np.ndarray) -> np.ndarray:
-        """World directions [..., 3] of pixels [..., 2], one unit of depth long."""
-        ones = np.ones((*pixels.shape[:-1], 1))
-        return np.concatenate([pixels, ones], -1) @ np.linalg.inv(self.K).T @ self.R
-
-
-class Sight(NamedTuple):
+class Observation(NamedTuple):
     """A fast region of one camera in one interval."""
 
     camera: int
@@ -69,7 +46,7 @@ class Passage:
 
     ends: np.ndarray  # [2, 3] world
     radius: float  # world
-    sights: list[Sight] = field(default_factory=list)
+    observations: list[Observation] = field(default_factory=list)
     before: Passage | None = None
     after: Passage | None = None
 
@@ -130,52 +107,54 @@ class Passage:
         return self.ends[0] + part * self.over + 4 * part * (1 - part) * self.bend(acceleration)
 
 
-def passages(cameras: Sequence[Viewpoint], sights: Sequence[Sight]) -> list[Passage]:
-    """The things that the sights of one interval show, those that most cameras see first."""
-    pairs = (pair for pair in itertools.combinations(sights, 2) if pair[0].camera != pair[1].camera)
-    alone = ([sight] for sight in sights if np.isfinite(sight.depth).all())
+def passages(cameras: Sequence[Camera], observations: Sequence[Observation]) -> list[Passage]:
+    """The things that the observations of one interval show, those that most cameras see first."""
+    pairs = (pair for pair in itertools.combinations(observations, 2) if pair[0].camera != pair[1].camera)
+    alone = ([one] for one in observations if np.isfinite(one.depth).all())
     tried = [ends for some in itertools.chain(pairs, alone) if (ends := _placed(cameras, some)) is not None]
     if not tried:
         return []
-    off = np.stack([_off(cameras[sight.camera], sight, np.array(tried)) for sight in sights], axis=1)
-    views, found = np.array([sight.camera for sight in sights]), []
+    off = np.stack([_off(cameras[one.camera], one, np.array(tried)) for one in observations], axis=1)
+    views, found = np.array([one.camera for one in observations]), []
     while np.isfinite(off).any():
         seeing = sum(np.isfinite(off[:, views == camera]).any(axis=1).astype(int) for camera in set(views))
         most = np.flatnonzero(seeing == seeing.max())
         best = min(most, key=lambda index: np.mean(off[index][np.isfinite(off[index])]))
         alike = np.flatnonzero(np.isfinite(off[best])).tolist()
-        shown = [sights[index] for index in alike]
+        shown = [observations[index] for index in alike]
         again = _placed(cameras, shown) if seeing[best] > 1 else None
         ends = tried[best] if again is None else again
-        sizes = [cameras[sight.camera].size(sight.radius, ends[0]) for sight in shown]
+        sizes = [one.radius / pixels_across(cameras[one.camera], ends)[0] for one in shown]
         found.append(Passage(ends, float(np.median(sizes)), shown))
         off[:, alike] = np.inf
     return found
 
 
-def _placed(cameras: Sequence[Viewpoint], sights: Sequence[Sight]) -> np.ndarray | None:
-    """The ends [2, 3] of the way of what sights of different cameras see, by D* where there is one alone."""
-    if len(sights) == 1:
-        camera = cameras[sights[0].camera]
-        return camera.place + camera.rays(sights[0].ends) * sights[0].depth[:, None]
-    places = np.array([cameras[sight.camera].place for sight in sights])
-    ends = []
-    for end in range(2):
-        rays = np.array([cameras[sight.camera].rays(sight.ends[end]) for sight in sights])
-        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-        across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
-        total = across.sum(0)
-        if np.linalg.cond(total) > 1e4:
-            return None
-        ends.append(np.linalg.solve(total, (across @ places[:, :, None]).sum(0))[:, 0])
-    return np.array(ends)
+def _placed(cameras: Sequence[Camera], observations: Sequence[Observation]) -> np.ndarray | None:
+    """The ends [2, 3] of the way of what observations of different cameras see, by D* where there is one alone."""
+    if len(observations) == 1:
+        return cameras[observations[0].camera].world(observations[0].ends, observations[0].depth)
+    centres = np.array([cameras[one.camera].centre for one in observations])[:, None]
+    rays = np.array([cameras[one.camera].world(one.ends, np.ones(2)) for one in observations]) - centres
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    across = np.eye(3) - rays[..., :, None] * rays[..., None, :]  # what is left of a place beside a ray
+    total = across.sum(axis=0)
+    if np.linalg.cond(total).max() > 1e4:  # all but parallel
+        return None
+    return np.linalg.solve(total, (across @ centres[..., None]).sum(axis=0))[..., 0]
 
 
-def _off(camera: Viewpoint, sight: Sight, ends: np.ndarray) -> np.ndarray:
-    """How far a sight is from where each of some ways [K, 2, 3] is seen, in what it may be; infinite beyond that."""
-    pixels, depth = camera.pixels(ends)
-    off = np.linalg.norm(pixels - sight.ends, axis=-1).max(axis=-1) / max(NEAR_PIXELS, NEAR * sight.radius)
-    return np.where((depth > 0).all(axis=-1) & (off <= 1), off, np.inf)
+def _off(camera: Camera, observation: Observation, ends: np.ndarray) -> np.ndarray:
+    """How far it is from where each of some ways [K, 2, 3] is seen, over what it may be; infinite beyond that."""
+    pixels, depth, _ = projected(camera, ends.reshape(-1, 3))
+    off = np.linalg.norm(pixels.reshape(-1, 2, 2) - observation.ends, axis=-1).max(axis=-1)
+    off = off / max(NEAR_PIXELS, NEAR * observation.radius)
+    return np.where((depth > 0).reshape(-1, 2).all(axis=-1) & (off <= 1), off, np.inf)
+
+
+def pixels_across(camera: Camera, points: np.ndarray) -> np.ndarray:
+    """How many pixels [K] one world unit takes at world points [K, 3]."""
+    return np.asarray(camera.K[0, 0] / projected(camera, points)[1])
 
 
 def link(intervals: Sequence[Sequence[Passage]]) -> None:
@@ -194,7 +173,7 @@ def join(before: Passage, after: Passage) -> None:
 
 def common_acceleration(intervals: Sequence[Sequence[Passage]]) -> np.ndarray | None:
     """The acceleration [3], world units per interval squared, that most passages share; None where they do not."""
-    changes = [b.after.over - b.over for each in intervals for b in each if b.after is not None for _ in b.sights]
+    changes = [b.after.over - b.over for each in intervals for b in each if b.after is not None for _ in b.observations]
     seen = np.array(changes).reshape(-1, 3)
     if len(seen) < FEWEST_AGREEING:
         return None

@@ -187,7 +187,7 @@ class TestHalfway:
         assert np.abs(halfway.colors.numpy().astype(int)[inner] - (240, 150, 20)).max() < 20
         assert (halfway.labels.numpy()[inner] == Label.VERIFIED).all()
 
-    def test_what_two_instants_show_turning_is_on_a_curve(self, tmp_path: Path) -> None:
+    def test_what_speeds_up_is_on_a_curve(self, tmp_path: Path) -> None:
         """A wide thing that speeds up: flow follows it, and its image halfway lies behind the middle."""
         band = cv2.GaussianBlur(np.random.default_rng(1).integers(0, 255, (HEIGHT, 60, 3)).astype(np.uint8), (0, 0), 2)
 

@@ -4,37 +4,36 @@ import tracemalloc
 
 import numpy as np
 import pytest
-import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from d2_plugin.priors.flights import Passage, Sight, Viewpoint, common_acceleration, join, link, passages
-from d2_plugin.protocol import CameraRecord
+from d2_plugin.priors.flights import Observation, Passage, common_acceleration, join, link, passages
+from d2_plugin.priors.geometry import projected
+from d2_plugin.recordings.recording import Camera
 
 FALL = np.array([0.0, 0.4, 0.0])
 UNKNOWN = np.full(2, np.nan)
 
 
-def camera(x: float, turned: float = 0.0) -> Viewpoint:
+def camera(x: float, turned: float = 0.0) -> Camera:
     """At (x, 0, -4), looking along z, turned about the vertical."""
-    K = torch.tensor([[200.0, 0, 160], [0, 200, 90], [0, 0, 1]], dtype=torch.float64)
-    pose = torch.eye(4, dtype=torch.float64)
     c, s = np.cos(turned), np.sin(turned)
-    pose[:3, :3] = torch.tensor([[c, 0, -s], [0, 1, 0], [s, 0, c]])
-    pose[:3, 3] = -pose[:3, :3] @ torch.tensor([x, 0, -4.0], dtype=torch.float64)
-    return Viewpoint(CameraRecord(K, pose))
+    pose = np.eye(4)
+    pose[:3, :3] = [[c, 0, -s], [0, 1, 0], [s, 0, c]]
+    pose[:3, 3] = -pose[:3, :3] @ [x, 0, -4.0]
+    return Camera(f"{x}", 320, 180, np.array([[200.0, 0, 160], [0, 200, 90], [0, 0, 1]]), pose)
 
 
 RIG = [camera(-1.5, 0.35), camera(0.0), camera(1.5, -0.35)]
 
 
-def sights(*ways: np.ndarray, cameras: list[int] | None = None, depth: bool = False) -> list[Sight]:
+def observations(*ways: np.ndarray, cameras: list[int] | None = None, depth: bool = False) -> list[Observation]:
     """What cameras of the rig see of balls of radius .1 that go over some ways [2, 3]."""
     seen = []
     for which in range(len(RIG)) if cameras is None else cameras:
         for number, ends in enumerate(ways):
-            pixels, depths = RIG[which].pixels(ends)
-            seen.append(Sight(which, number, pixels, 0.1 * RIG[which].focal / depths[0], depths if depth else UNKNOWN))
+            pixels, depths, _ = projected(RIG[which], ends)
+            seen.append(Observation(which, number, pixels, 0.1 * 200 / depths[0], depths if depth else UNKNOWN))
     return seen
 
 
@@ -45,7 +44,7 @@ def thrown(count: int, bounce: int | None = None) -> list[list[Passage]]:
         if index == bounce:
             speed = speed * (1, -1, 1)
         over = speed + FALL / 2
-        intervals.append([Passage(np.array([place, place + over]), 0.1, sights(np.array([place, place + over])))])
+        intervals.append([Passage(np.array([place, place + over]), 0.1, observations(np.array([place, place + over])))])
         place, speed = place + over, speed + FALL
     link(intervals)
     return intervals
@@ -60,33 +59,35 @@ class TestPlaces:
     def test_rays_of_two_cameras_place_a_thing_exactly_without_any_depth(
         self, start: np.ndarray, end: np.ndarray
     ) -> None:
-        found = passages(RIG, sights(np.array([start, end])))
-        assert [len(passage.sights) for passage in found] == [3]
+        found = passages(RIG, observations(np.array([start, end])))
+        assert [len(passage.observations) for passage in found] == [3]
         np.testing.assert_allclose(found[0].ends, [start, end], atol=1e-9)
         assert found[0].radius == pytest.approx(0.1, rel=1e-6)
 
     def test_each_of_two_things_is_found_once_whoever_sees_them(self) -> None:
         ways = np.array([[-0.5, 0, 0], [-0.2, 0.1, 0]]), np.array([[0.5, -0.3, 0.5], [0.5, 0.2, 0.5]])
-        found = passages(RIG, [*sights(ways[0], cameras=[0, 2]), *sights(ways[1], cameras=[0, 1])])
-        assert sorted(tuple(sorted(sight.camera for sight in passage.sights)) for passage in found) == [(0, 1), (0, 2)]
+        found = passages(RIG, [*observations(ways[0], cameras=[0, 2]), *observations(ways[1], cameras=[0, 1])])
+        assert sorted(
+            tuple(sorted(observation.camera for observation in passage.observations)) for passage in found
+        ) == [(0, 1), (0, 2)]
         for passage, truth in zip(sorted(found, key=lambda one: one.ends[0][0]), ways):
             np.testing.assert_allclose(passage.ends, truth, atol=1e-9)
 
     def test_one_camera_places_it_by_its_depth_and_not_at_all_without(self) -> None:
         truth = np.array([[-0.5, 0, 0], [-0.2, 0.1, 0]])
-        found = passages(RIG, sights(truth, cameras=[1], depth=True))
+        found = passages(RIG, observations(truth, cameras=[1], depth=True))
         np.testing.assert_allclose(found[0].ends, truth, atol=1e-9)
-        assert passages(RIG, sights(truth, cameras=[1])) == []
+        assert passages(RIG, observations(truth, cameras=[1])) == []
         assert passages(RIG, []) == []
 
     def test_regions_that_no_one_thing_explains_are_no_thing(self) -> None:
         one, other = np.array([[-0.5, 0, 0], [-0.2, 0.1, 0]]), np.array([[0.5, -0.5, 0.5], [0.5, 0.2, 0.5]])
-        assert passages(RIG, [*sights(one, cameras=[0]), *sights(other, cameras=[1])]) == []
+        assert passages(RIG, [*observations(one, cameras=[0]), *observations(other, cameras=[1])]) == []
 
     def test_rays_that_are_all_but_parallel_or_meet_behind_a_camera_place_nothing(self) -> None:
         beside = [camera(0.0), camera(1e-4)]
         truth = np.array([[0.0, 0, 0], [0.3, 0, 0]])
-        seen = [Sight(which, 0, view.pixels(truth)[0], 5.0, UNKNOWN) for which, view in enumerate(beside)]
+        seen = [Observation(which, 0, projected(view, truth)[0], 5.0, UNKNOWN) for which, view in enumerate(beside)]
         assert passages(beside, seen) == []
         crossed = [seen[0], seen[1]._replace(ends=seen[1].ends + (40.0, 0))]  # they meet behind both
         assert passages([camera(0.0), camera(1.0)], crossed) == []
@@ -98,7 +99,7 @@ class TestFall:
         intervals = thrown(7)
         for index in range(0, 6, 2):
             ways = noise.normal(size=(3, 3))
-            one, other = (Passage(ways[i : i + 2], 0.1, [intervals[0][0].sights[0]]) for i in (0, 1))
+            one, other = (Passage(ways[i : i + 2], 0.1, [intervals[0][0].observations[0]]) for i in (0, 1))
             join(one, other)
             intervals[index].append(one)
         np.testing.assert_allclose(common_acceleration(intervals), FALL, atol=1e-9)
@@ -107,7 +108,7 @@ class TestFall:
         noise, intervals = np.random.default_rng(0), []
         for _ in range(20):
             ways = noise.normal(size=(3, 3))
-            one, other = (Passage(ways[i : i + 2], 0.1, thrown(1)[0][0].sights[:1]) for i in (0, 1))
+            one, other = (Passage(ways[i : i + 2], 0.1, thrown(1)[0][0].observations[:1]) for i in (0, 1))
             join(one, other)
             intervals.append([one, other])
         assert common_acceleration(intervals) is None
