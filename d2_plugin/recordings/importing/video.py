@@ -251,18 +251,20 @@ class Decoder:
 
     def _frame(self, index: int) -> Any:
         why = ""
-        try:
-            self._approach(index)
-            for frame in self._frames:
-                place = self._place(frame)
-                if place < index:
-                    continue
-                self._reached = place
-                if place > index or frame.is_corrupt:
+        # An MPEG stream, and a group of pictures that is open, may be entered behind the frame: then farther in front.
+        for back in (0,) if self.video.counted else (0, 1, 2, len(self.video.stamps)):
+            try:
+                self._approach(index, back)
+                for frame in self._frames:
+                    place = self._place(frame)
+                    if place < index:
+                        continue
+                    self._reached = place
+                    if place == index and not frame.is_corrupt:
+                        return frame
                     break
-                return frame
-        except (pyav().error.FFmpegError, OSError, IndexError) as failure:
-            why = f" ({said(failure)})"
+            except (pyav().error.FFmpegError, OSError, IndexError) as failure:
+                why = f" ({said(failure)})"
         self.close()
         raise D2Error(
             f"frame {index} of {shown_path(self.video.path)} cannot be decoded{why}: repair the video, leave "
@@ -276,18 +278,22 @@ class Decoder:
         stamp = frame.pts if frame.pts is not None else frame.dts
         return -1 if stamp is None else int(np.searchsorted(self.video.stamps, stamp))
 
-    def _approach(self, index: int) -> None:
-        """Open the file where it is not, and stand at the last key frame before `index` or, nearer, where one is."""
-        if self.video.counted and index <= self._reached:
+    def _approach(self, index: int, back: int) -> None:
+        """Stand at the last key frame before `index`, or nearer where that is so; `back` key frames in front of it."""
+        key = bisect_right(self.video.keys, index) - 1 - back
+        from_the_first = back > 0 and key < 0
+        if from_the_first or (self.video.counted and index <= self._reached):
             self.close()
         if self._container is None:
             self._container = open_container(self.video.path)
             self._container.streams.video[0].thread_type = "AUTO"
             self._frames = self._container.decode(video=0)
-        behind = index <= self._reached
-        if not self.video.counted and (behind or decoded_alone(self.video, index) > self._reached + 1):
+        if from_the_first or self.video.counted:
+            return
+        if back or index <= self._reached or decoded_alone(self.video, index) > self._reached + 1:
             stream = self._container.streams.video[0]
-            self._container.seek(int(self.video.stamps[index]), stream=stream, backward=True)
+            target = self.video.stamps[self.video.keys[key] if back else index]
+            self._container.seek(int(target), stream=stream, backward=True)
             self._frames = self._container.decode(video=0)
 
 

@@ -117,6 +117,25 @@ def test_the_containers_of_cameras_are_read(suffix: str, tmp_path: Path) -> None
     assert len(read_video(write_video(tmp_path / f"a{suffix}", images(5), [i / 25 for i in range(5)])).stamps) == 5
 
 
+@pytest.mark.parametrize("name", ["a.ts", "open.mp4"])
+def test_frames_of_mpeg_streams_and_open_groups_of_pictures_are_read_in_any_order(name: str, tmp_path: Path) -> None:
+    """A container may be entered behind the frame that is sought."""
+    av = pytest.importorskip("av")
+    with av.open(str(tmp_path / name), "w") as container:
+        stream = container.add_stream("libx264", rate=25)
+        stream.height, stream.width, stream.pix_fmt, stream.gop_size = *SIZE, "yuv420p", 6
+        stream.options = {"bf": "2", "x264-params": "open-gop=1"}
+        for image in images(20):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
+        container.mux(stream.encode())
+    video = read_video(tmp_path / name)
+    decoder = Decoder(video)
+    forward = [decoder.image(i) for i in range(len(video.stamps))]
+    for start in (17, 11, 5, 0, 13):
+        assert (decoder.image(start) == forward[start]).all()
+        assert (Decoder(video).image(start) == forward[start]).all()
+
+
 def wall(count: int, shift: int = 0, gain: float = 1.0) -> list[np.ndarray]:
     """A wall of soft noise; from the middle on it lies `shift` pixels beside, and it becomes brighter up to `gain`."""
     cv2 = pytest.importorskip("cv2")
