@@ -210,6 +210,18 @@ def test_a_sensor_beside_one_of_two_cameras_leaves_stereo(moving, tmp_path: Path
     assert plan_scene(recording, PAIR, None, PriorSettings(stereo=StereoSettings(matcher="patchmatch"))).uses("stereo")
 
 
+def test_a_scene_before_the_near_plane_is_refused(moving, tmp_path: Path) -> None:
+    """In kilometres, say: no Gaussian would be drawn."""
+    poses = {name: moving.cameras[name].T_camera_world * [[1, 1, 1, 1e-3]] for name in PAIR}
+    tiny = [replace(moving.cameras[name], T_camera_world=pose, near_far=None) for name, pose in poses.items()]
+    for one in tiny:
+        one.T_camera_world[3, 3] = 1
+    path = save_recording(rig(select_frames(moving, [0]), *tiny), tmp_path / "scene")
+    settings = RunSettings(str(path), tuple(PAIR), iterations=2, hooks=())
+    refuses("set `near = 0.0", Run(settings, tmp_path / "run").train)
+    Run(replace(settings, overrides={"backbone": {"raster": {"near": 2e-4}}}), tmp_path / "drawn").train()
+
+
 def test_no_stereo_reaches_the_priors(moving, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing is matched, and monocular depth stands alone where its scale is known."""
     apart = replace(select_frames(moving, [0, 1]), mono_kind="metric")
