@@ -47,7 +47,7 @@ def psnr(image: Tensor, truth: Tensor, within: np.ndarray | None = None) -> floa
     first, second = _pair(image, truth)
     squared = np.square(first - second)
     error = float(squared.mean() if within is None else squared[:, within].mean())
-    return -10 * math.log10(error) if error > 0 else math.inf
+    return math.inf if error == 0 else -10 * math.log10(error)
 
 
 def psnr_color_corrected(image: Tensor, truth: Tensor) -> float:

@@ -136,6 +136,7 @@ def test_colour_correction_neither_flatters_a_blurred_render_nor_invents_contras
 def test_the_examples_of_the_docstrings_run_and_equal_images_are_infinitely_alike() -> None:
     assert doctest.testmod(metrics).failed == 0
     assert metrics.psnr(torch.zeros(4, 5, 3), torch.zeros(4, 5, 3)) == math.inf
+    assert math.isnan(metrics.psnr(torch.full((4, 5, 3), math.nan), torch.zeros(4, 5, 3))), "no number is no likeness"
 
 
 CONVOLUTIONS = {
