@@ -31,6 +31,8 @@ _HEAD = 1 << 22  # bytes in which the size of an image stands; profiles of a JPE
 _REMEDY = "replace the file or leave this frame out"
 _JPEG_SIZE_MARKERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # SOF0..15 without DHT, JPG, DAC
 
+_SCAN = frozenset({0xDA})  # what follows it has no end marker but its own; a thumbnail has one before
+
 
 def opencv(purpose: str, extra: str = "image") -> ModuleType:
     """The module cv2; `purpose` completes the sentence "<purpose> needs OpenCV".
@@ -157,7 +159,7 @@ def _whole(path: Path) -> bytes:
     if encoded.startswith(_PNG_SIGNATURE):
         if not _png_is_whole(encoded):
             raise _unreadable(path, " (cut off, or its checksums are wrong)")
-    elif b"\xff\xd9" not in encoded[-(1 << 16) :]:
+    elif encoded.find(b"\xff\xd9", _jpeg_segment(path, encoded, _SCAN)) < 0:  # a phone may append a video to it
         raise _unreadable(path, " (cut off: its end marker is missing)")
     return encoded
 
@@ -197,12 +199,18 @@ def _png_is_whole(data: bytes) -> bool:
 
 
 def _jpeg_size(path: Path, data: bytes) -> tuple[int, int]:
+    position = _jpeg_segment(path, data, _JPEG_SIZE_MARKERS)
+    height, width = struct.unpack(">HH", data[position + 5 : position + 9])
+    return width, height
+
+
+def _jpeg_segment(path: Path, data: bytes, markers: frozenset[int]) -> int:
+    """Where the first segment of one of the `markers` begins."""
     position = 2
     while position + 9 <= len(data) and data[position] == 0xFF:
         marker, length = data[position + 1], struct.unpack(">H", data[position + 2 : position + 4])[0]
-        if marker in _JPEG_SIZE_MARKERS:
-            height, width = struct.unpack(">HH", data[position + 5 : position + 9])
-            return width, height
+        if marker in markers:
+            return position
         position += 1 if marker == 0xFF else 2 + length  # a fill byte, or a whole segment
     raise _unreadable(path)
 

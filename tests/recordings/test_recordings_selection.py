@@ -53,6 +53,16 @@ def test_a_image_rotated_by_its_metadata_keeps_the_stored_pixel_order(tmp_path: 
     assert read_image(path).shape == (20, 30, 3)
 
 
+def test_a_photo_with_a_video_behind_it_is_whole_and_one_with_a_thumbnail_before_its_cut_is_not(tmp_path: Path) -> None:
+    path, thumbnail = tmp_path / "photo.jpg", b"\xff\xd8\xff\xd9"
+    cv2.imwrite(str(path), np.random.default_rng(0).integers(0, 256, (20, 30, 3), np.uint8))
+    data = path.read_bytes()
+    path.write_bytes(data + bytes(1 << 17))  # phones append what they filmed
+    assert read_image(path).shape == (20, 30, 3)
+    path.write_bytes(data[:2] + b"\xff\xe1" + struct.pack(">H", 2 + len(thumbnail)) + thumbnail + data[2:-100])
+    refuses("end marker is missing", read_image, path)
+
+
 def test_only_images_need_opencv(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = save_recording(synthetic_recording(cameras=1, frames=1, width=16, height=16), tmp_path / "scene")
     monkeypatch.setitem(sys.modules, "cv2", None)
