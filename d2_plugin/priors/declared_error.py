@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from d2_plugin.errors import D2Error
 from d2_plugin.protocol import Label
 from d2_plugin.recordings.recording import Recording
 from d2_plugin.recordings.selection import spread
@@ -90,6 +91,9 @@ def held_against_truth(
         store: the priors.
         recording: the recording they were built for; 0 in a true depth map is a place without depth, such as sky.
         frames: all of the store where None.
+
+    Raises:
+        D2Error: a recording of another size than the priors'.
     """
     collected: dict[Label, list[np.ndarray]] = {label: [] for label in DECLARED}
     views = pixels = sky = sky_far = surface_far = 0
@@ -99,6 +103,12 @@ def held_against_truth(
             prior = None if truth is None else store.prior(camera, frame)
             if truth is None or prior is None or prior.sigma is None:
                 continue
+            if prior.depth.shape != truth.shape:
+                (rows, columns), (true_rows, true_columns) = prior.depth.shape, truth.shape
+                raise D2Error(
+                    f"the prior of camera {camera} has {columns}x{rows} pixels and its true depth "
+                    f"{true_columns}x{true_rows}: open the recording with the downscale of the prior"
+                )
             depth, labels, sigma = prior.depth.numpy(), prior.labels.numpy(), prior.sigma.numpy()
             known, far = np.isfinite(truth) & (truth > 0), labels == Label.FAR
             rounding = truth_rounding(truth)

@@ -23,6 +23,7 @@ from d2_plugin.errors import D2Error, MissingExtra
 from d2_plugin.priors.build import PriorSummary, build_priors
 from d2_plugin.priors.construct import NO_MAP, SCALE_UNKNOWN
 from d2_plugin.priors.dask_build import build_priors_on_cluster
+from d2_plugin.priors.declared_error import held_against_truth
 from d2_plugin.priors.frame import Frame
 from d2_plugin.priors.monocular.align import align
 from d2_plugin.priors.settings import PriorSettings, StereoSettings
@@ -32,6 +33,7 @@ from d2_plugin.protocol import Label
 from d2_plugin.recordings import open_recording
 from d2_plugin.recordings.export.folder import save_recording
 from d2_plugin.recordings.recording import Recording
+from d2_plugin.recordings.selection import downscale
 from d2_plugin.recordings.synthetic.room import synthetic_recording
 from d2_plugin.store.store import PriorStore
 
@@ -85,6 +87,12 @@ def errors_of(recording: Recording, store: PriorStore, label: Label) -> np.ndarr
         mask = prior.labels.numpy() == label
         found.append(np.abs(prior.depth.numpy() - truth)[mask] / truth[mask])
     return np.concatenate(found)
+
+
+def test_true_depth_of_another_size_is_refused(plain: Recording, built: tuple[Path, PriorSummary]) -> None:
+    refuses(
+        "160x90 pixels and its true depth 80x45", held_against_truth, PriorStore.open(built[0]), downscale(plain, 2)
+    )
 
 
 def test_verified_pixels_are_right_and_others_the_better_the_more_cameras_agree(plain: Recording, built: tuple) -> None:
