@@ -15,12 +15,13 @@ from torch import Tensor
 from d2_plugin import registry
 from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.moving import Harmonics, MovingGaussians
+from d2_plugin.priors.frame import describe_recording
 from d2_plugin.protocol import View
 from d2_plugin.recordings import Camera, Recording, Source
 from d2_plugin.runs.run import Run
 from d2_plugin.runs.saved import load_checkpoint, read_metrics
 from d2_plugin.runs.start import TimedPoints
-from d2_plugin.store.store import PriorStore
+from d2_plugin.store.store import PriorStore, other_recording
 from d2_plugin.viewing.camera_paths import for_size
 
 UNKNOWN_IMAGE = 60
@@ -145,6 +146,8 @@ def viewed_recording(recording: Recording, priors: Path | None = None) -> Viewed
             f"{priors} has priors of camera {unknown[0]}, which {recording.name} does not have: "
             "give the recording that they were built for"
         )
+    if why := other_recording(store.about, describe_recording(recording)):
+        raise D2Error(f"{priors} is no prior of {recording.name} ({why}): give its recording and its --downscale")
     return ViewedRun(recording.name, recording, store.cameras, store=store)
 
 

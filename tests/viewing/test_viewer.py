@@ -344,6 +344,8 @@ class TestSentences:
         page = built(found)
         assert "show" not in page.controls
         assert page.word("cloud", "") == "image"
+        small = ViewSettings(trained / "priors", recording=room, downscale=2)
+        refuses("pixels there and .* here.*--downscale", viewed_at, small)
         alone = viewed_at(ViewSettings(trained / "priors"))
         assert np.array_equal(alone.recording.image("train0", 0), found.recording.image("train0", 0))
 
