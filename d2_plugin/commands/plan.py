@@ -42,9 +42,9 @@ def described(recording: Recording) -> str:
 
 
 def _clock(recording: Recording) -> Iterable[str]:
-    """How far apart the cameras expose, or that nothing says whether they are synchronised."""
+    """How far images are from the instants of their numbers, or that nothing says that cameras are synchronised."""
     late = [abs(seconds) * recording.fps for times in recording.late.values() for seconds in times.values()]
     if late:
-        yield f"cameras expose up to {max(late):.2f} frames apart; each image is trained at its own instant"
+        yield f"images were taken up to {max(late):.2f} frames off their numbers' instants; each is trained at its own"
     elif len(recording.frames) > 1 and not Path(recording.path or "", "import", "clocks.json").is_file():
         yield "nothing says how the cameras were synchronised: equal frame numbers are taken as one instant"

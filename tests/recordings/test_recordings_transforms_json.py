@@ -71,6 +71,15 @@ def test_frames_are_counted_by_time_where_names_do_not_run_with_it(tmp_path: Pat
     assert (recording.image("test", 1) == 0).all()
 
 
+def test_uneven_times_stay_those_of_the_file(tmp_path: Path) -> None:
+    times = (3.0, 3.1, 3.2, 4.0)
+    write(tmp_path, [entry(f"images/cam{c}_{f:04d}", x=c, time=t) for c in (0, 7) for f, t in enumerate(times)])
+    recording = open_recording(tmp_path)
+    for camera in recording.cameras:
+        assert [recording.seconds(f, camera) for f in recording.frames] == pytest.approx([0, 0.1, 0.2, 1])
+    assert not open_recording(write(tmp_path / "even", two_by_two())).late
+
+
 def test_folders_of_splits_are_no_cameras(tmp_path: Path) -> None:
     names = ("train/cam01", "train/cam02", "test/cam00")
     frames = [entry(f"{name}_{f:04d}", x=i, time=f / 30) for i, name in enumerate(names) for f in range(2)]

@@ -66,7 +66,9 @@ def export_recording(
     for camera in recording.cameras.values():
         refuse_skew(camera.name, camera.K)
     if recording.late and layout != "transforms":
-        logging.getLogger(__name__).warning("cameras expose apart, which %s cannot say: choose transforms", layout)
+        logging.getLogger(__name__).warning(
+            "images have instants of their own, which %s cannot say: choose transforms", layout
+        )
     with whole_folder(path) as folder:
         written = WRITERS[layout](Export(recording, held_out, cloud, folder))
         description = {

@@ -25,6 +25,8 @@ from d2_plugin.values import counted
 FILES = ("transforms.json", "transforms_train.json", "transforms_val.json", "transforms_test.json")
 """All that are there are read; their images are joined."""
 
+ROUNDED = 0.01  # frames by which times are off that were written with few digits
+
 STATIC_FPS = 30.0  # frame rate of files without times, where it means nothing
 
 
@@ -51,11 +53,17 @@ def open_transforms(path: Path, cameras: tuple[str, ...] | None = None, intersec
     first = {shot.camera: entries[name] for name, shot in shots.items() if shot.frame == frames[0]}
     calibrated = {name: _camera(name, first[name]) for name in images}
     notes = (*notes, *_split_notes(entries, shots), *frame_notes)
+    recording = assembled(path, calibrated, images, frames, fps, str(path), notes)
+    begin = next((entries[name].image.time for name, shot in shots.items() if shot.frame == frames[0]), None)
     late: dict[str, dict[int, float]] = {}
     for name, shot in shots.items():
-        if entries[name].image.late:
-            late.setdefault(shot.camera, {})[shot.frame] = entries[name].image.late
-    return replace(assembled(path, calibrated, images, frames, fps, str(path), notes), late=late)
+        own = entries[name].image.late
+        if begin is not None and (time := entries[name].image.time) is not None:
+            uneven = time - begin - recording.seconds(shot.frame)
+            own += uneven if abs(uneven) * fps > ROUNDED else 0.0
+        if own:
+            late.setdefault(shot.camera, {})[shot.frame] = own
+    return replace(recording, late=late)
 
 
 def _entries(path: Path) -> dict[str, _Entry]:

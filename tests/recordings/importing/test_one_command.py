@@ -110,7 +110,7 @@ def test_the_commands_and_a_stopped_import_goes_on(filmed: Filmed, tmp_path: Pat
     assert "3 cameras, 3 frames at 24 per second, 160x90 pixels" in said
     said = answered("plan", str(folder), "--train-cameras", "all")
     assert "3 training cameras, " in said
-    assert "cameras expose up to 0." in said
+    assert "images were taken up to 0." in said
     files = [folder / "import" / "clocks.json", folder / "cameras.json", *(folder / "images").rglob("*.png")]
     before = {path: (path.read_bytes(), path.stat().st_mtime_ns) for path in files}
     (folder / "cameras.json").unlink()
