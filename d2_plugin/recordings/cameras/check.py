@@ -18,13 +18,15 @@ import numpy as np
 
 from d2_plugin.errors import D2Error
 from d2_plugin.recordings.cameras.calibrating.features import Features, find_features, match_all
-from d2_plugin.recordings.cameras.camera import field_of_view, same_spot
+from d2_plugin.recordings.cameras.calibration import LARGE_RIG
+from d2_plugin.recordings.cameras.camera import field_of_view, rig_width, same_spot
 from d2_plugin.recordings.cameras.epipolar import sampson
 from d2_plugin.recordings.images import opencv
 from d2_plugin.recordings.recording import Camera, Recording
 from d2_plugin.recordings.selection import spread
 
 USUAL_VIEW = (5.0, 170.0)  # degrees across or down that a camera usually sees
+USUAL_RATE = 0.2, 5000.0  # frames per second
 FAR_FROM_ORIGIN = 1e4  # A rig this many times as far from the origin as it is wide loses digits in float32
 
 DEPTHS = np.geomspace(0.05, 1000, 25)
@@ -70,7 +72,7 @@ def check_recording(recording: Recording, cameras: Sequence[str], scored: Sequen
         for frame in _frames(recording, len(scored)):
             recording.depth(name, frame)
     masks = _empty_masks(recording, cameras, _frames(recording, len(cameras)))
-    seen = (*_views(rig), *_origin(rig), *_alone(rig), *_plain(recording, cameras), *masks)
+    seen = (*_views(rig), *_origin(rig), *_units(recording, rig), *_alone(rig), *_plain(recording, cameras), *masks)
     said = _missed(_checked(recording, _features(recording, cameras)))
     return (*seen, said) if said else seen
 
@@ -114,6 +116,17 @@ def _origin(rig: Sequence[Camera]) -> Iterator[str]:
         if distance > 10 * FAR_FROM_ORIGIN * width:  # a step of float32 is a hundredth of the rig: pixels
             raise D2Error(said)
         yield said
+
+
+def _units(recording: Recording, rig: Sequence[Camera]) -> Iterator[str]:
+    """Units in which things move by much more or less than a unit of length in one of time: they are learnt worse."""
+    if (width := rig_width(rig)) > LARGE_RIG:
+        yield f"the cameras stand up to {width:.3g} apart: what moves is learnt worse in such units, so give metres"
+    if len(recording.frames) > 1 and not USUAL_RATE[0] <= recording.rate <= USUAL_RATE[1]:
+        yield (
+            f"there are {recording.rate:.3g} frames per unit of time, expected {USUAL_RATE[0]:g} to {USUAL_RATE[1]:g}: "
+            "give seconds, or minutes of a time lapse, since the scene is learnt worse so"
+        )
 
 
 def _alone(rig: Sequence[Camera]) -> Iterator[str]:
