@@ -224,6 +224,10 @@ def _notes_of_videos(settings: ImportSettings, videos: Mapping[str, VideoFile], 
     """
     hdr = ", ".join(f"{name} ({video.hdr})" for name, video in videos.items() if video.hdr)
     notes = [f"HDR of {hdr} was converted to BT.709: what is brighter than white paper is white"] if hdr else []
+    if halves := ", ".join(name for name, video in videos.items() if video.interlaced):
+        notes.append(
+            f"frames of {halves} are two half images, so what moves has combs: deinterlace them (ffmpeg -vf bwdif)"
+        )
     for name, steady in steadiness(few).items():
         if steady.moved:
             first, last = steady.between

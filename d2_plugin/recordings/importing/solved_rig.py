@@ -35,6 +35,7 @@ MOMENTS = 8  # images of each camera that are read, spread over the recording
 BOARD_MOMENTS = 24  # the same where a board was filmed, which is held in many places
 TOGETHER = 0.1  # frames by which cameras may expose apart for what moves to be a witness
 BOARD_TOGETHER = 0.5  # the same for a board, which is held still
+SQUARE = 0.01  # by how much a pixel may be wider than high, or less, and count as square
 SHARED, EACH = "shared", "each"  # focal lengths that are not known: one for all cameras, or one for each of them
 
 
@@ -56,6 +57,13 @@ def rig_of_videos(
     """
     if len(videos) < 2:
         raise D2Error("one video says nothing about where its camera stands: give two at least, or --calibration FILE")
+    for name, video in videos.items():
+        if choices.intrinsics is None and abs(video.stretched - 1) > SQUARE:
+            raise D2Error(
+                f"the pixels of video {name} are {video.stretched:.3g} times as wide as high, and lenses are found for "
+                "square ones: give --intrinsics of the stored images, or convert it (`ffmpeg -i OLD -vf "
+                "scale=iw*sar:ih,setsar=1 NEW`)"
+            )
     board = None if choices.board is None else Board.parsed(choices.board)
     distance = None if choices.distance is None else _distance(choices.distance, list(videos))
     lenses = _lenses(choices.intrinsics, choices.focal, {name: video.size for name, video in videos.items()})

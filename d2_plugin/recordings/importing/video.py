@@ -57,6 +57,8 @@ class VideoFile:
     sound: bool = False
     counted: bool = False  # frames are found by their order, since what the container says of their times has none
     keys: tuple[int, ...] = ()  # frames that need no other one, ascending, as the container knows them
+    stretched: float = 1.0  # how many times as wide as high a stored pixel is
+    interlaced: bool = False  # whether a frame is two half images, taken one after the other
     hdr: str = ""  # how its colours are coded where that is no BT.709, such as "PQ, BT.2020"; they are converted
 
     @property
@@ -146,14 +148,15 @@ def read_video(path: Path) -> VideoFile:
         stamps, keys = _stamps(container.decode(stream) if counted else packets, path)
         places = [container, *container.streams.video, *container.streams]
         timecode = next((place.metadata["timecode"] for place in places if "timecode" in place.metadata), None)
-        sound = bool(container.streams.audio)
+        sound, stretched = bool(container.streams.audio), float(stream.sample_aspect_ratio or 1)
     first = _first_frame(path)
     turn = 90 * (round(float(first.rotation) / 90) % 4)
     coding = [
         name for table, code in ((HDR, first.color_trc), (WIDE, first.color_primaries)) if (name := table.get(code))
     ]
     size, hdr = (first.width, first.height), ", ".join(coding)
-    return VideoFile(path, size, turn, stamps, unit, timecode, sound, counted, keys, hdr)
+    shown = stretched, bool(first.interlaced_frame), hdr
+    return VideoFile(path, size, turn, stamps, unit, timecode, sound, counted, keys, *shown)
 
 
 def _stamps(shown: Iterator[Any], path: Path) -> tuple[np.ndarray, tuple[int, ...]]:

@@ -1,5 +1,6 @@
 """A video as its container describes it: time stamps, turn, timecode, and its frames in any order."""
 
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,8 @@ from refusals import refuses
 from stand_in_recordings import smooth_recording
 
 from d2_plugin.recordings import open_recording, select_cameras, select_frames
+from d2_plugin.recordings.importing.settings import ImportChoices
+from d2_plugin.recordings.importing.solved_rig import rig_of_videos
 from d2_plugin.recordings.importing.steady import steadiness
 from d2_plugin.recordings.importing.video import Decoder, read_video
 from d2_plugin.recordings.recording import Recording
@@ -115,6 +118,23 @@ def test_hdr_becomes_what_other_cameras_show(tmp_path: Path) -> None:
 @pytest.mark.parametrize("suffix", [".mp4", ".mov", ".mkv", ".mts", ".m2ts", ".avi"])
 def test_the_containers_of_cameras_are_read(suffix: str, tmp_path: Path) -> None:
     assert len(read_video(write_video(tmp_path / f"a{suffix}", images(5), [i / 25 for i in range(5)])).stamps) == 5
+
+
+def test_half_images_and_pixels_that_are_not_square_are_known_and_no_lens_is_found_for_the_latter(
+    tmp_path: Path,
+) -> None:
+    av = pytest.importorskip("av")
+    for name in ("a.mp4", "b.mp4"):
+        with av.open(str(tmp_path / name), "w") as container:
+            stream = container.add_stream("libx264", rate=25)
+            stream.height, stream.width, stream.pix_fmt = *SIZE, "yuv420p"
+            stream.options, stream.codec_context.sample_aspect_ratio = {"x264-params": "tff=1"}, Fraction(4, 3)
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(images(1)[0], format="rgb24")))
+            container.mux(stream.encode())
+    videos = {name: read_video(tmp_path / f"{name}.mp4") for name in ("a", "b")}
+    assert videos["a"].interlaced
+    assert not read_video(write_video(tmp_path / "c.mp4", images(2), [0, 0.04])).interlaced
+    refuses("pixels of video a are 1.33 times as wide as high", rig_of_videos, videos, ImportChoices())
 
 
 @pytest.mark.parametrize("name", ["a.ts", "open.mp4"])
