@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from d2_plugin.recordings.importing.video import container_of, pyav
+from d2_plugin.recordings.importing.video import begin_of, container_of, pyav
 
 RATE = 16_000  # samples per second that are compared
 BAND = (100.0, 4000.0)  # hertz: below is wind and hum, above is what lossy sound loses first
@@ -62,7 +62,7 @@ def read_sound(path: Path) -> Sound | None:
         for frame in container.decode(audio=0):
             for part in resampler.resample(frame):
                 if start is None:
-                    start = float(part.pts * part.time_base) if part.pts is not None else 0.0
+                    start = float(part.pts * part.time_base) - begin_of(container) if part.pts is not None else 0.0
                 parts.append(part.to_ndarray()[0])
                 length += len(parts[-1])
             if length > MOST_SECONDS * RATE:

@@ -59,6 +59,7 @@ class VideoFile:
     keys: tuple[int, ...] = ()  # frames that need no other one, ascending, as the container knows them
     stretched: float = 1.0  # how many times as wide as high a stored pixel is
     interlaced: bool = False  # whether a frame is two half images, taken one after the other
+    begin: float = 0.0  # seconds on the clock of an MPEG stream at which the file begins, see `begin_of`
     hdr: str = ""  # how its colours are coded where that is no BT.709, such as "PQ, BT.2020"; they are converted
 
     @property
@@ -74,7 +75,7 @@ class VideoFile:
     @property
     def times(self) -> np.ndarray:
         """[N] seconds on the clock of the file, which the sound shares."""
-        return self.stamps * float(self.unit)
+        return self.stamps * float(self.unit) - self.begin
 
     @property
     def rate(self) -> float:
@@ -149,14 +150,20 @@ def read_video(path: Path) -> VideoFile:
         places = [container, *container.streams.video, *container.streams]
         timecode = next((place.metadata["timecode"] for place in places if "timecode" in place.metadata), None)
         sound, stretched = bool(container.streams.audio), float(stream.sample_aspect_ratio or 1)
+        begin = begin_of(container)
     first = _first_frame(path)
     turn = 90 * (round(float(first.rotation) / 90) % 4)
     coding = [
         name for table, code in ((HDR, first.color_trc), (WIDE, first.color_primaries)) if (name := table.get(code))
     ]
     size, hdr = (first.width, first.height), ", ".join(coding)
-    shown = stretched, bool(first.interlaced_frame), hdr
+    shown = stretched, bool(first.interlaced_frame), begin, hdr
     return VideoFile(path, size, turn, stamps, unit, timecode, sound, counted, keys, *shown)
+
+
+def begin_of(container: Any) -> float:
+    """When an MPEG stream begins, in seconds; 0 elsewhere. The stamps of such a stream begin at any number."""
+    return (container.start_time or 0) / 1e6 if container.format.name.startswith("mpeg") else 0.0
 
 
 def _stamps(shown: Iterator[Any], path: Path) -> tuple[np.ndarray, tuple[int, ...]]:

@@ -7,15 +7,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from recorded import SOUND_RATE, graded, room_sound
+from recorded import SOUND_RATE, graded, room_sound, write_video
 from refusals import refuses
 
 from d2_plugin.recordings import Camera, Recording, open_recording
 from d2_plugin.recordings.importing.clocks import Clock, Evidence, _solved, common_clock, given_clock, timecode_seconds
 from d2_plugin.recordings.importing.grid import Grid, grid_of
 from d2_plugin.recordings.importing.motion import Seen, offsets_from_motion, watch
-from d2_plugin.recordings.importing.sound import RATE, Sound, lag_between
-from d2_plugin.recordings.importing.video import VideoFile
+from d2_plugin.recordings.importing.sound import RATE, Sound, lag_between, read_sound
+from d2_plugin.recordings.importing.video import VideoFile, read_video
 
 cv2 = pytest.importorskip("cv2")
 
@@ -32,6 +32,18 @@ cv2 = pytest.importorskip("cv2")
 )
 def test_timecode_counts_frames_as_smpte_12m_does(text: str, rate: float, seconds: float) -> None:
     assert timecode_seconds(text, rate) == pytest.approx(seconds, abs=1e-9)
+
+
+def test_the_clock_of_an_mpeg_stream_begins_with_it_whatever_its_stamps_begin_at(tmp_path: Path) -> None:
+    images, times = [np.full((48, 64, 3), 9 * i, np.uint8) for i in range(10)], np.arange(10) / 25
+    one, other = (read_video(write_video(tmp_path / f"{at}.ts", images, list(times + at))) for at in (0.0, 7.3))
+    assert other.times == pytest.approx(one.times, abs=1e-4)
+    sounds = []
+    for lead in (0.5, 0.8):
+        sound = room_sound(4.0)[round(lead * SOUND_RATE) :]
+        write_video(tmp_path / f"heard{lead}.ts", images, list(times), sound=sound)
+        sounds.append(read_sound(tmp_path / f"heard{lead}.ts"))
+    assert lag_between(*sounds).seconds == pytest.approx(0.3, abs=0.01)
 
 
 @pytest.mark.parametrize("text", ["", "noon", "00:61:00:00", "00:00:00:30", "1:2:3"])
