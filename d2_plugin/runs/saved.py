@@ -87,7 +87,8 @@ def _refuse_another(folder: Path, identity: Mapping[str, Any]) -> None:
     table = read_run(folder)
     guidance = {"guidance": table.pop("guidance")} if "guidance" in table else {}
     kept = RunSettings.from_table(table, str(folder / "run.json")).as_table() | guidance
-    changed = sorted(k for k in identity.keys() | kept.keys() if identity.get(k) != kept.get(k))
+    names = (identity.keys() | kept.keys()) - {"accept_empty_prior"}  # it changes nothing but whether there is a run
+    changed = sorted(k for k in names if identity.get(k) != kept.get(k))
     if changed:
         raise D2Error(
             f"{folder} holds another run, made with other settings of {', '.join(changed)}: "

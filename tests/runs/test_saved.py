@@ -5,6 +5,7 @@ import itertools
 import math
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -209,6 +210,12 @@ class TestThePriorOfARun:
         points, first = (read_table(path, COST)["seconds"] for path in sorted(tmp_path.rglob("*.seconds.json")))
         second.side_effect = None
         assert share(settings, tmp_path).seconds > points + first
+
+
+def test_a_run_whose_prior_is_empty_goes_on_as_its_refusal_proposes(scene, tmp_path) -> None:
+    settings = RunSettings(str(scene), ("train0",), iterations=2, hooks=("depth_loss",))
+    refuses("by --accept-empty-prior", Run(settings, tmp_path / "run").train)
+    Run(replace(settings, accept_empty_prior=True), tmp_path / "run").train()
 
 
 def test_a_run_goes_on_from_the_checkpoint_before_one_that_cannot_be_written(scene, tmp_path, monkeypatch) -> None:
