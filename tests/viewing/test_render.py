@@ -143,6 +143,7 @@ def test_what_cannot_be_shown_is_one_sentence(trained: Path, room: Path, tmp_pat
         assert "is a folder of a run, which knows its recording" in refused("render", trained, *more)
     assert "did you mean 'orbit'?" in refused("render", trained, "--path", "orbti")
     assert "did you mean 'depth'?" in refused("render", trained, "--show", "rgb,deph")
+    assert "train1 is a training one: choose --path training" in refused("render", trained, "--cameras", "train1")
     assert "did you mean 'test0'?" in refused("render", trained, "--cameras", "test")
     assert "at the recording's cameras only" in refused("render", trained, "--path", "orbit", "--show", "error")
 

@@ -127,9 +127,14 @@ def _instants(viewed: ViewedRun, settings: RenderSettings, count: int, fps: floa
 
 
 def _standing(viewed: ViewedRun, settings: RenderSettings, fps: float) -> list[Stop]:
-    of_path = viewed.test_cameras if settings.path == "held-out" else viewed.train_cameras
+    of_path, others = viewed.test_cameras, viewed.train_cameras
+    if settings.path == "training":
+        of_path, others = others, of_path
     names = settings.cameras or of_path
     refuse_unknown("camera", names, viewed.recording.cameras)
+    if wrong := [name for name in names if name in others and name not in of_path]:
+        right = "training" if settings.path == "held-out" else "held-out"
+        raise D2Error(f"camera {wrong[0]} is a {right} one: choose --path {right}, or other --cameras")
     if not names:
         raise D2Error(f"{viewed.name} has no held-out camera: choose --path training or orbit")
     if settings.seconds is not None:
