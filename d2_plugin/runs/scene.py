@@ -66,8 +66,8 @@ class Scene:
                     "smaller --downscale or larger images"
                 )
         check_memory(recording, train)
-        check_background_weight(recording, train, settings.background_weight)
-        notes = (*recording.notes, *check_recording(recording, (*train, *test), scored=test))
+        masks = check_background_weight(recording, train, settings.background_weight)
+        notes = (*recording.notes, *masks, *check_recording(recording, (*train, *test), scored=test))
         notes += (*_at_one_point(recording, train),)
         for name in sorted({*settings.hooks} - {*hooks_in_use(settings), "prior"}):
             notes += (f"a run of {settings.iterations} steps leaves `{name}` out: a table [{name}] brings it back",)

@@ -1,6 +1,7 @@
 """Masks beside images: what is foreground, and what was recorded at all."""
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from d2_plugin.priors.fuse import fuse
 from d2_plugin.protocol import Label
 from d2_plugin.recordings import open_recording
 from d2_plugin.recordings.cameras.camera import CalibratedCamera
+from d2_plugin.recordings.cameras.check import check_background_weight
 from d2_plugin.recordings.cameras.lens import Lens
 from d2_plugin.recordings.cameras.undistort import Undistortion
 from d2_plugin.recordings.export.folder import save_recording
@@ -153,6 +155,17 @@ def test_training_weighs_by_masks_and_never_by_what_was_not_recorded(tmp_path: P
     assert by_view["cam01", 0] is None
     unweighted = TrainingFrames(recording, CAMERAS).weights(0)
     assert (unweighted[0, -1], unweighted[-1, 0]) == (1, 0)
+
+
+def test_images_without_a_mask_are_named_where_masks_weigh(tmp_path: Path) -> None:
+    recording = open_recording(recorded_folder(tmp_path / "recording"))
+    assert check_background_weight(recording, CAMERAS, 1) == ()
+    one, other = check_background_weight(recording, CAMERAS, 0.5)
+    assert "camera cam00 has no foreground mask at frame 1:" in one
+    assert "camera cam01 has no foreground mask at frame 0, 1:" in other
+    refuses("has no foreground mask: put masks at", check_background_weight, recording, CAMERAS[1:], 0.5)
+    shutil.move(tmp_path / "recording/masks/cam00/0000.png", tmp_path / "recording/masks/cam00/0001.png")
+    assert len(check_background_weight(open_recording(tmp_path / "recording"), CAMERAS, 0.5)) == 2
 
 
 def test_the_score_inside_the_mask(tmp_path: Path) -> None:

@@ -77,17 +77,26 @@ def check_recording(recording: Recording, cameras: Sequence[str], scored: Sequen
     return (*seen, said) if said else seen
 
 
-def check_background_weight(recording: Recording, cameras: Sequence[str], weight: float) -> None:
-    """Refuse a weight that would change nothing, since there is no mask.
+def check_background_weight(recording: Recording, cameras: Sequence[str], weight: float) -> tuple[str, ...]:
+    """Which images a weight below 1 leaves whole, since they have no foreground mask, a sentence for each camera.
 
     Raises:
-        D2Error: no training camera has a foreground mask at the first frame.
+        D2Error: that is all of those that are read.
     """
-    if weight < 1 and all(recording.mask(name, recording.frames[0]) is None for name in cameras):
+    if weight >= 1:
+        return ()
+    read = _frames(recording, len(cameras))
+    without = {name: [frame for frame in read if recording.mask(name, frame) is None] for name in cameras}
+    if all(len(frames) == len(read) for frames in without.values()):
         raise D2Error(
             f"--background-weight is {weight:g} and {recording.name} has no foreground mask: put masks at "
             "masks/CAMERA/FRAME.png, or leave the weight at 1"
         )
+    return tuple(
+        f"camera {name} has no foreground mask at frame {_some(frames)}: all of such an image is trained"
+        for name, frames in without.items()
+        if frames
+    )
 
 
 def _views(rig: Sequence[Camera]) -> Iterator[str]:
