@@ -168,6 +168,13 @@ def test_calibrations_that_cannot_be_are_refused(folder: Path, changes: dict, me
     refused(folder, message)
 
 
+@pytest.mark.parametrize("table", ["bounds", "exposures", "late"])
+def test_tables_of_cameras_that_are_not_there_are_named(folder: Path, table: str) -> None:
+    description = json.loads((folder / "cameras.json").read_text())
+    (folder / "cameras.json").write_text(json.dumps({**description, table: {"camera 7": {}}}))
+    assert f"{table} of camera 7 in cameras.json are of no camera there" in open_recording(folder).notes
+
+
 def test_broken_descriptions_are_refused(folder: Path) -> None:
     edit_calibration(folder, None, bounds={"train0": [3.0, 1.0]})
     refused(folder, "depth bounds 3 to 1")

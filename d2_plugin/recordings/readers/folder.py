@@ -58,6 +58,9 @@ def open_folder(path: Path, cameras: tuple[str, ...] | None = None, intersect: b
     fps, fps_notes = DEFAULT_FPS, (f"cameras.json names no fps: {DEFAULT_FPS:g} taken",) if len(frames) > 1 else ()
     if "fps" in description:
         fps, fps_notes = checked_rate(field(description, "fps", float, where, CORRECT), where), ()
+    for table in ("bounds", "exposures", "late"):
+        unknown = sorted(field(description, table, dict, where, CORRECT, default={}).keys() - calibrated.keys())
+        notes += (f"{table} of {', '.join(unknown)} in cameras.json are of no camera there",) if unknown else ()
     chosen = {name: calibrated[name] for name in names}
     recording = assembled(path, chosen, images, frames, fps, where, (*notes, *frame_notes, *fps_notes))
     return with_measured(recording, description, where)
