@@ -106,7 +106,7 @@ def test_a_rig_far_from_the_origin_is_named_and_one_whose_places_float32_cannot_
 
 
 def test_centimetres_and_milliseconds_are_named(room: Recording) -> None:
-    """The bundled 4D Gaussians lose 5 to 7 dB so."""
+    """The bundled 4D Gaussians lose 5 to 8 dB of what moves so."""
     poses = {name: camera.T_camera_world.copy() for name, camera in room.cameras.items()}
     wide = room
     for name, pose in poses.items():
