@@ -145,6 +145,7 @@ class Run:
         with self._writing():
             points = self.prepare(on_prior)
             trainer = self._trainer(points)
+            _refuse_before_the_near_plane(trainer.model)
             self._restore(trainer)
             watching = watch(trainer) if watch else lambda step, loss: None
             iterations = self.settings.iterations
@@ -290,6 +291,18 @@ class Run:
             yield keep
         finally:
             keep()
+
+
+def _refuse_before_the_near_plane(model: Any) -> None:
+    """Refuse a scene most of which the rasterizer would not draw."""
+    raster = getattr(getattr(model, "settings", None), "raster", None)
+    near, median = getattr(raster, "near", 0.0), 2 * getattr(model, "extent", float("inf"))
+    if median <= near:
+        raise D2Error(
+            f"the cameras see most of the scene nearer than {median:.2g} and Gaussians nearer than {near:g} are not "
+            f"drawn: give the recording in a smaller unit, or set `near = {0.05 * median:.1g}` under "
+            "[backbone.raster] in the TOML of --config"
+        )
 
 
 def _refuse_another_recording(folder: Path, scene: Scene) -> None:

@@ -19,7 +19,7 @@ from d2_plugin.recordings.checks.memory import check_memory
 from d2_plugin.runs.metrics import GAUSSIAN_WINDOW
 from d2_plugin.runs.plan import ScenePlan, appearance_decision, plan_scene
 from d2_plugin.runs.settings import RunSettings, hooks_in_use, prior_settings, training_settings
-from d2_plugin.runs.start import Extent, TimedPoints, TrainingFrames, initial_points, scene_extent
+from d2_plugin.runs.start import TimedPoints, TrainingFrames, initial_points, scene_extent
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +114,6 @@ class Scene:
             temporal=self.plan.uses("temporal"),
             settings=needed | dict(settings.overrides.get("backbone", {})),
         )
-        _refuse_before_the_near_plane(model, extent)
         # A model that learns exposures begins with those that the import of the videos measured.
         gains = {name: one.gain for name, one in recording.exposures.items() if name in (*cameras, *self.test_cameras)}
         if gains and (begin := getattr(getattr(model, "appearance", None), "start_from", None)):
@@ -134,18 +133,6 @@ class Guidance(Protocol):
 
     def hooks(self, scene: Scene, points: TimedPoints, priors: Path) -> Mapping[str, Hook]:
         """The hooks that run in place of D2's, by name."""
-
-
-def _refuse_before_the_near_plane(model: Any, extent: Extent) -> None:
-    """Refuse a scene most of which the rasterizer would not draw."""
-    raster = getattr(getattr(model, "settings", None), "raster", None)
-    near, median = getattr(raster, "near", 0.0), 2 * extent.radius
-    if median <= near:
-        raise D2Error(
-            f"the cameras see most of the scene nearer than {median:.2g} and Gaussians nearer than {near:g} are not "
-            f"drawn: give the recording in a smaller unit, or set `near = {0.05 * median:.1g}` under "
-            "[backbone.raster] in the TOML of --config"
-        )
 
 
 def _without_held_out_instants(recording: Recording, every: int) -> tuple[Recording, tuple[int, ...]]:
