@@ -11,8 +11,10 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
+from d2_plugin.hooks.carried_on import CarriedOn
 from d2_plugin.hooks.expected import check_splats
 from d2_plugin.hooks.hook import Context, Hook, HookConfig, Surveyed
+from d2_plugin.hooks.views import back_project
 from d2_plugin.protocol import DepthPrior, Edit, Label, Points, Splats, View
 from d2_plugin.settings import Count, Every, Positive, Range, Share, Steps
 
@@ -73,6 +75,9 @@ class DensifyConfig(HookConfig):
     """Standard deviation of a new Gaussian, which is round, in units of the distance between samples."""
     opacity: Annotated[float, Range(1e-6, 1)] = 0.1
     """Opacity of a new Gaussian. A faint one cannot spoil what stands; training makes it opaque where it is right."""
+    carry_on: bool = True
+    """Whether what one camera alone sees gets the depth of what is known beside it, see `d2_plugin.hooks.carried_on`;
+    the paper has no such depth."""
     lifetime: Positive | None = 1.0
     """Standard deviation in time of a new Gaussian where the image moves, in intervals from instant to instant, in a
     backbone that has one; none: as it begins there. New ones stand still."""
@@ -105,14 +110,6 @@ def under_reconstructed(depth: Tensor, valid: Tensor, prior: Tensor, support: Te
     """
     delta = torch.abs(depth - prior) / (prior + EPSILON)  # meaningful where the prior has support (D* > 0)
     return support & (~valid | (delta > tau_u))
-
-
-def back_project(view: View, pixels: Tensor, depth: Tensor) -> Tensor:
-    """World points [K, 3] = Pi^-1(p, D) of pixels [K, 2] (column, row; integers) at planar depths [K]."""
-    centres = torch.cat([pixels.to(depth) + 0.5, torch.ones_like(depth)[:, None]], -1)
-    camera = torch.linalg.solve_ex(view.K.to(depth), centres.T).result.T * depth[:, None]
-    rotation, translation = view.T_camera_world[:3, :3].to(depth), view.T_camera_world[:3, 3].to(depth)
-    return (camera - translation) @ rotation  # R^T (x - t), row by row
 
 
 def shuffled_pixels(mask: Tensor, generator: torch.Generator) -> Tensor:
@@ -199,7 +196,7 @@ class Densify(Hook):
 
     def __init__(self, config: DensifyConfig) -> None:
         super().__init__(config)
-        self._moving = MovingPixels()
+        self._moving, self._carry_on = MovingPixels(), CarriedOn()
         self._full = False
 
     def edit(self, context: Context) -> Edit | None:
@@ -212,7 +209,7 @@ class Densify(Hook):
             log.warning("step %d: %d Gaussians, so none are inserted: max_gaussians = %d", context.step, count, most)
         inserted: list[Points] = []
         for surveyed, lives in (
-            *((surveyed, self._lifetimes(surveyed.view, context)) for surveyed in context.evaluation),
+            *(self._carried_on(surveyed, context) for surveyed in context.evaluation),
             *((surveyed, self._interval_everywhere(surveyed.view, context)) for surveyed in context.halfway),
         ):
             budget = min(self.config.budget_per_view, room - sum(len(p.positions) for p in inserted))
@@ -250,6 +247,14 @@ class Densify(Hook):
         times, opacities = torch.full_like(target, view.time), torch.full_like(target, config.opacity)
         lifetimes = None if lifetimes is None else lifetimes[row, column]
         return Points(positions, colors, times, scales, opacities, lifetimes).select(free)
+
+    def _carried_on(self, surveyed: Surveyed, context: Context) -> tuple[Surveyed, Tensor | None]:
+        """A view, its prior carried on to what its camera alone sees; and `_lifetimes` of its pixels."""
+        lives = self._lifetimes(surveyed.view, context)
+        if not self.config.carry_on:
+            return surveyed, lives
+        still = None if lives is None else torch.isinf(lives)
+        return surveyed._replace(prior=self._carry_on(surveyed.prior, surveyed.view, context, still)), lives
 
     def _lifetimes(self, view: View, context: Context) -> Tensor | None:
         """How long a new Gaussian may live at each pixel [H, W], infinite where nothing moves; None: not known."""

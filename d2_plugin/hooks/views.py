@@ -1,4 +1,4 @@
-"""Which training views an evaluation looks at: a stratified sample that visits all of them in turn."""
+"""Which training views an evaluation looks at: a stratified sample that visits all of them in turn; their rays."""
 
 from __future__ import annotations
 
@@ -8,12 +8,21 @@ from dataclasses import replace
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from d2_plugin.hooks.expected import check_view
 from d2_plugin.protocol import View
 
 MOST = 64
 """Views of one sample, at most, of a recording that is long for its run."""
+
+
+def back_project(view: View, pixels: Tensor, depth: Tensor) -> Tensor:
+    """World points [K, 3] = Pi^-1(p, D) of pixels [K, 2] (column, row; integers) at planar depths [K]."""
+    centres = torch.cat([pixels.to(depth) + 0.5, torch.ones_like(depth)[:, None]], -1)
+    camera = torch.linalg.solve_ex(view.K.to(depth), centres.T).result.T * depth[:, None]
+    rotation, translation = view.T_camera_world[:3, :3].to(depth), view.T_camera_world[:3, 3].to(depth)
+    return (camera - translation) @ rotation  # R^T (x - t), row by row
 
 
 class ViewSampler:
