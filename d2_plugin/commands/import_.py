@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from shlex import quote
+
 from d2_plugin.commands.arguments.recording import show_notes
 from d2_plugin.progress import show
 from d2_plugin.recordings.importing.importing import import_videos
@@ -18,5 +20,5 @@ def run(settings: ImportSettings) -> str:
     sizes = sorted({(camera.width, camera.height) for camera in recording.cameras.values()})
     shown = ", ".join(f"{width}x{height}" for width, height in sizes)
     frames = f"{counted(len(recording.frames), 'frame')} at {recording.rate:g} per second"
-    plan = f"`d2 plan {settings.output} --train-cameras all` says what is used and what is left out"
+    plan = f"`d2 plan {quote(str(settings.output))} --train-cameras all` says what is used and what is left out"
     return f"{counted(len(recording.cameras), 'camera')}, {frames}, {shown} pixels in {settings.output}\n{plan}"

@@ -10,6 +10,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 from d2_plugin import registry
@@ -93,7 +94,7 @@ class Run:
             with only_writer(folder):
                 write_table(folder / "run.json", settings.as_table(), saved.RUN)
         elif not Path(settings.recording).exists():
-            remedy = f"if it was moved, `d2 eval {folder} --recording PATH` says where to"
+            remedy = f"if it was moved, `d2 eval {quote(str(folder))} --recording PATH` says where to"
             raise D2Error(f"{settings.recording}, the recording of {folder}, is not there: {remedy}")
         return cls(settings, folder)
 

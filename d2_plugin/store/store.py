@@ -26,6 +26,7 @@ import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 import numpy as np
@@ -157,7 +158,8 @@ class PriorStore:
     def described(cls, path: Path) -> PriorStore:
         """The store at `path` by its description alone; no record is looked at."""
         if not (path / "store.json").is_file():
-            raise D2Error(f"no depth priors at {path}: build them with `d2 priors RECORDING --output {path}`")
+            build = f"d2 priors RECORDING --output {quote(str(path))}"
+            raise D2Error(f"no depth priors at {path}: build them with `{build}`")
         table = read_table(path / "store.json", STORE)
         return cls(path, table["cameras"], table["frames"], table["about"])
 

@@ -76,7 +76,7 @@ def test_evaluating_again_gives_the_same_scores(finished: Path) -> None:
 
 
 def test_a_run_finds_its_recording_where_that_was_moved(finished, recording, tmp_path, answered, refused) -> None:
-    run, place = shutil.copytree(finished, tmp_path / "full"), shutil.copytree(recording, tmp_path / "here")
+    run, place = shutil.copytree(finished, tmp_path / "a run"), shutil.copytree(recording, tmp_path / "here")
     scores = json.loads((finished / "metrics.json").read_text())["per_view"]
 
     def evaluated(*more: str) -> object:
@@ -85,7 +85,7 @@ def test_a_run_finds_its_recording_where_that_was_moved(finished, recording, tmp
 
     assert evaluated("--recording", str(place)) == scores
     moved = place.rename(tmp_path / "there")
-    remedy = f"if it was moved, `d2 eval {run} --recording PATH` says where to"
+    remedy = f"if it was moved, `d2 eval '{run}' --recording PATH` says where to"
     assert f"{place}, the recording of {run}, is not there: {remedy}" in refused("eval", str(run))
     refused("eval", str(run), "--recording", str(tmp_path))
     assert remedy in refused("render", str(run)), "what is no recording was not kept"

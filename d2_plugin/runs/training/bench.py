@@ -15,6 +15,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from shlex import quote
 from typing import Annotated, Any, Literal, NamedTuple
 
 from d2_plugin.errors import D2Error
@@ -105,7 +106,7 @@ def run(
         runs = len(lines) * len(set(settings.seeds)) * len(_targets(settings))
         with written(path, name, runs, **(about or {})) as write:
             follow(lines, submit, write)
-    return f"rows are in {path}; `d2 report {path}` draws them"
+    return f"rows are in {path}; `d2 report {quote(str(path))}` draws them"
 
 
 class Case(NamedTuple):
