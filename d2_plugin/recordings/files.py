@@ -22,6 +22,7 @@ FrameFiles = dict[int, Path]
 MOST_DIGITS = 9  # of a frame number
 
 _LAST_NUMBER = re.compile(r"(\d+)\D*$")
+_SECONDS = re.compile(r"\d+\.\d+")
 _PREFIXED = re.compile(r"(?P<camera>.+)_(?P<frame>\d+)$")
 
 
@@ -51,6 +52,8 @@ def numbered_files(folder: Path, suffixes: Collection[str] = IMAGE_SUFFIXES) -> 
         number = _LAST_NUMBER.search(path.stem)
         if number is None:
             raise D2Error(f"{path} has no frame number in its name: name it like 00012{path.suffix}")
+        if _SECONDS.fullmatch(path.stem):
+            raise D2Error(f"{path} is named by a time: name the frames 00000{path.suffix}, 00001{path.suffix}, ...")
         frame = frame_number(number[1], path)
         if frame in files:
             raise D2Error(f"{files[frame].name} and {path.name} in {path.parent} are both frame {frame}: remove one")

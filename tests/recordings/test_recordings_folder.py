@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -132,7 +133,9 @@ def test_images_that_fit_no_camera_or_frame_are_refused(folder: Path) -> None:
     refused(folder, r"00001\.png and 1\.png .* are both frame 1")
     (images / "1.png").rename(images / "cover.png")
     refused(folder, "no frame number")
-    (images / "cover.png").unlink()
+    (images / "cover.png").rename(images / "0.042.png")
+    refused(folder, r"0\.042\.png is named by a time: name the frames 00000\.png, 00001\.png")
+    (images / "0.042.png").unlink()
     shutil.copytree(images, folder / "images" / "extra")
     refused(folder, r"camera extra has images but is not in .*cameras\.json, which has train0, train1, test0")
     assert any("extra" in note for note in open_recording(folder, intersect=True).notes)
@@ -166,6 +169,11 @@ def test_images_of_two_sizes_are_refused_when_read(folder: Path) -> None:
 def test_calibrations_that_cannot_be_are_refused(folder: Path, changes: dict, message: str) -> None:
     edit_calibration(folder, 0, **changes)
     refused(folder, message)
+
+
+def test_cameras_late_by_more_than_a_thousand_units_are_read_back(original: Recording, tmp_path: Path) -> None:
+    late = {"train0": {0: 0.0, 1: 4200.0}}  # a clock in milliseconds
+    assert open_recording(save_recording(replace(original, late=late), tmp_path / "late")).late == late
 
 
 @pytest.mark.parametrize("table", ["bounds", "exposures", "late"])

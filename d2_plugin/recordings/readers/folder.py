@@ -24,7 +24,7 @@ from d2_plugin.recordings.cameras.formats.cameras_json import read_camera
 from d2_plugin.recordings.files import camera_folders, cameras_with_images, common_frames, frame_number, numbered_files
 from d2_plugin.recordings.images import image_size
 from d2_plugin.recordings.recording import Exposure, Recording
-from d2_plugin.values import Range
+from d2_plugin.values import MOST, Range
 
 CALIBRATION = "cameras.json"
 
@@ -32,7 +32,7 @@ DEFAULT_FPS = 30.0  # frame rate that is assumed, with a note, where cameras.jso
 
 GAIN = Annotated[float, Range(1e-3, 1e3)]
 ERROR = Annotated[float, Range(0, 1e3)]
-LATE = Annotated[float, Range(-1e3, 1e3)]
+LATE = Annotated[float, Range(-MOST, MOST)]
 
 
 def is_folder(path: Path) -> bool:
