@@ -48,7 +48,7 @@ def write_page(scenes: Sequence[ExportScene], path: Path) -> list[str]:
     """Write the page of one scene, or of two of one recording to compare; returns what it says of itself.
 
     Raises:
-        D2Error: scenes of different recordings, or a file that `d2 export` did not write.
+        D2Error: scenes with other cameras or frames, or a file that `d2 export` did not write.
     """
     refuse_foreign(path, f'content="{GENERATOR} ', "d2 export")
     last, data = scenes[-1], bytearray()
@@ -56,7 +56,8 @@ def write_page(scenes: Sequence[ExportScene], path: Path) -> list[str]:
         where = [[camera.name for camera in one.cameras] for one in (scene, last)]
         if scene.viewed.recording.frames != last.viewed.recording.frames or sorted(where[0]) != sorted(where[1]):
             raise D2Error(
-                f"{scene.viewed.name} and {last.viewed.name} are of different recordings: compare runs of one recording"
+                f"{scene.viewed.name} and {last.viewed.name} have not the same cameras and frames: compare runs of one "
+                "recording with the same --frames"
             )
     images = _recorded(last, data)
     models, about = [], []

@@ -98,7 +98,7 @@ class TestThePage:
 
     def test_runs_of_two_recordings_are_not_compared(self, tmp_path: Path) -> None:
         scenes = [make_scene(sharp_model("yang4d", 50), "a", names) for names in (("l", "m", "r"), ("l", "m", "s"))]
-        refuses("of different recordings: compare runs of one recording", write_page, scenes, tmp_path / "scene.html")
+        refuses("not the same cameras and frames: compare runs of one", write_page, scenes, tmp_path / "scene.html")
 
     @pytest.mark.parametrize("backbone", ["yang4d", "deform"])
     def test_a_reader_finds_the_gaussians_within_a_hundredth_of_a_pixel(self, tmp_path: Path, backbone: str) -> None:
