@@ -11,7 +11,7 @@ from typing import Annotated
 
 import d2_plugin
 from d2_plugin.commands.arguments.form import HELP, Form, ModuleCommand
-from d2_plugin.errors import D2Error
+from d2_plugin.errors import D2Error, refuse_unknown
 from d2_plugin.settings import Positional, Settings
 
 TRAINING = ModuleCommand(
@@ -55,4 +55,6 @@ def _checkout(part: str) -> Callable[[list[str]], str | None]:
         )
     if str(folder.parent) not in sys.path:
         sys.path.insert(0, str(folder.parent))
-    return importlib.import_module(f"{folder.name}.__main__").answer
+    parts = importlib.import_module(f"{folder.name}.__main__")
+    refuse_unknown("benchmark", [part], ["training", *parts.PARTS])
+    return parts.answer

@@ -14,6 +14,7 @@ from stand_in_recordings import renamed
 from d2_plugin import progress
 from d2_plugin.backbones import yang4d
 from d2_plugin.commands.arguments.form import Given
+from d2_plugin.commands.arguments.recording import hook_names
 from d2_plugin.commands.cli import COMMANDS, main
 from d2_plugin.config import DensifyConfig
 from d2_plugin.recordings.export.folder import save_recording
@@ -70,11 +71,16 @@ class TestHelp:
         assert "d2 bench training" in answered("bench", "training", "--help")
         assert main(["bench", "raster", "--help"]) == 0, "this is a checkout"
         assert "python -m benchmarks raster" in capsys.readouterr().out
+        assert "did you mean 'training'?" in refused("bench", "trainng")
         monkeypatch.setattr("d2_plugin.__file__", str(tmp_path / "site-packages" / "d2_plugin" / "__init__.py"))
         assert "'raster' is measured from a checkout alone" in refused("bench", "raster")
 
 
 class TestTables:
+    def test_hooks_that_are_named_in_another_order_are_the_same_run(self) -> None:
+        assert hook_names("prune,densify, prune") == hook_names("densify,prune")
+        assert hook_names("parallax,motion,depth_loss,prune,densify,prior") == hook_names("all")
+
     def test_flags_stand_over_the_file_and_the_file_over_the_defaults(self, recording, tmp_path, capsys) -> None:
         config = tmp_path / "d2.toml"
         config.write_text(

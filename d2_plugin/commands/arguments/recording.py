@@ -130,7 +130,7 @@ def hook_names(text: str) -> tuple[str, ...]:
             raise D2Error(f"--hooks says '{text}': {name} stands alone, or name the hooks, joined by commas")
         if name not in HOOK_NAMES:
             raise unknown_name("hook", name, [*HOOK_NAMES, "all", "none"])
-    return names
+    return tuple(name for name in HOOK_NAMES if name in names)  # in whatever order they are named, it is one run
 
 
 def read_toml(path: Path | None) -> dict[str, Any]:
