@@ -323,6 +323,22 @@ def test_a_frame_that_the_network_did_not_see_has_the_prior_of_the_other_sources
         np.testing.assert_array_equal(one.numpy(), two.numpy())
 
 
+def test_frames_that_are_not_there_and_views_in_another_order_are_named(room, maps, tmp_path, caplog) -> None:
+    other = write_multiview(room, ["train2", "train0", "train1"], tmp_path / "maps")
+    source = partial(MultiviewSource, cache=tmp_path / "cache", read=partial(Frame.read, room, NAMES))
+    for folder, named in ((maps, False), (other, True)):
+        source(room, NAMES, replace(ALONE, multiview=str(folder))).views(Frame.read(room, NAMES, 0))
+        assert ("another order, say so in multiview.json" in caplog.text) == named
+    (other / "00000.npz").unlink()
+    assert "lacks" not in caplog.text
+    source(room, NAMES, replace(ALONE, multiview=str(other)))
+    assert "lacks 1 of 2 frames, frame 0 first" in caplog.text
+    (other / "00001.npz").rename(other / "00007.npz")
+    refuses(
+        "frames 7 to 7 and none of the recording's, 0 to 1", source, room, NAMES, replace(ALONE, multiview=str(other))
+    )
+
+
 def test_the_cameras_that_the_network_saw_may_be_more_and_in_another_order(room, maps, tmp_path) -> None:
     other = write_multiview(room, ["train2", "train0", "train1"], tmp_path / "maps", posed=True)
     (other / "multiview.json").write_text('{"cameras": ["train2", "train0", "train1"], "emulated": true}')

@@ -34,17 +34,31 @@ def pose_scale(poses: np.ndarray, cameras: Sequence[Camera]) -> float:
         poses: world to camera [V, 3, 4].
         cameras: the calibrated ones, in the same order.
     """
-    ours = np.stack([camera.T_camera_world[:3, :3] for camera in cameras])
     centres = np.stack([camera.centre for camera in cameras])
-    theirs = poses[:, :, :3]
-    predicted = -(theirs.transpose(0, 2, 1) @ poses[:, :, 3:])[..., 0]
+    predicted = -(poses[:, :, :3].transpose(0, 2, 1) @ poses[:, :, 3:])[..., 0]
     if not np.isfinite(poses).all():
         return np.nan
-    left, _, right = np.linalg.svd((ours.transpose(0, 2, 1) @ theirs).sum(0))
-    rotation = left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right
+    rotation = _to_our_world(poses, cameras)
     moved, target = (predicted - predicted.mean(0)) @ rotation.T, centres - centres.mean(0)
     size = float((moved * moved).sum())
     return float((moved * target).sum()) / size if size > 0 else np.nan
+
+
+def turned_by(poses: np.ndarray, cameras: Sequence[Camera]) -> float:
+    """By how many degrees the predicted pose that is furthest from its camera is turned, in the world of the cameras;
+    arguments as of `pose_scale`, NaN where it is."""
+    if not np.isfinite(poses).all():
+        return np.nan
+    moved = poses[:, :, :3] @ _to_our_world(poses, cameras).T
+    cosines = (np.einsum("vij,vij->v", moved, [camera.T_camera_world[:3, :3] for camera in cameras]) - 1) / 2
+    return float(np.degrees(np.arccos(np.clip(cosines, -1, 1))).max())
+
+
+def _to_our_world(poses: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
+    """The rotation from the world of predicted poses to that of the cameras."""
+    ours = np.stack([camera.T_camera_world[:3, :3] for camera in cameras])
+    left, _, right = np.linalg.svd((ours.transpose(0, 2, 1) @ poses[:, :, :3]).sum(0))
+    return left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right
 
 
 def world_scale(maps: Mapping[str, np.ndarray], cameras: Mapping[str, Camera], poses: np.ndarray | None) -> float:

@@ -16,14 +16,14 @@ from d2_plugin.priors.maps_on_disk import planar
 from d2_plugin.priors.monocular.network import MonocularModel
 from d2_plugin.priors.multiview.moving import Instant, follow_images
 from d2_plugin.priors.multiview.predicted import Predicted, declared, prediction_files, read_prediction, understood
-from d2_plugin.priors.multiview.scale import log_ratio, world_scale
+from d2_plugin.priors.multiview.scale import log_ratio, turned_by, world_scale
 from d2_plugin.priors.scene_flow import STILL_INSTANTS
 from d2_plugin.priors.settings import PriorSettings
 from d2_plugin.recordings.images import opencv
 from d2_plugin.recordings.recording import Camera, Recording
 from d2_plugin.recordings.selection import spread
 from d2_plugin.store.files import EntryFolder, hash_of
-from d2_plugin.values import shown
+from d2_plugin.values import counted, shown
 
 log = logging.getLogger(__name__)
 
@@ -32,6 +32,9 @@ SCALED_AT = 3
 """At so many instants, spread over the recording, its scale is measured; their median counts."""
 CROPPED = 0.05
 """Maps and images may differ by this share in their ratio of width to height: networks round to patches of 14."""
+
+TURNED = 10.0
+"""Degrees by which no network's poses are off that saw these cameras in this order."""
 
 CAMERAS = ("poses", "intrinsics")
 """What is cached of a prediction beside its maps."""
@@ -83,9 +86,21 @@ class MultiviewSource:
             self.files, self._fingerprint = {}, self.model.fingerprint()
         else:
             self.files = prediction_files(path)
+            self._name_missing(path)
             self._read_order(declared(path).get("cameras"), path)
         self.entries = EntryFolder(cache, synced=False)
         self.about = multiview_about(path)
+
+    def _name_missing(self, folder: Path) -> None:
+        missing = [frame for frame in self.frames if frame not in self.files]
+        if len(missing) == len(self.frames):
+            raise D2Error(
+                f"{folder} has frames {min(self.files)} to {max(self.files)} and none of the recording's, "
+                f"{self.frames[0]} to {self.frames[-1]}: name each file like the images of its instant"
+            )
+        if missing:
+            frames = counted(len(self.frames), "frame")
+            log.warning("%s lacks %d of %s, frame %d first", folder, len(missing), frames, missing[0])
 
     def _read_order(self, cameras: Any, folder: Path) -> None:
         if cameras is None:
@@ -148,8 +163,17 @@ class MultiviewSource:
             logs = np.array([self._measured(frame, first) for frame in spread(there, SCALED_AT)])
             logs = logs[np.isfinite(logs)]
             self._scale = float(np.median(logs)) if logs.size else 0.0, first
+            self._name_other_order(first)
         scale, first = self._scale
         return float(np.exp(scale - self._against(number, first)))
+
+    def _name_other_order(self, first: Predicted) -> None:
+        off = 0.0 if first.poses is None else turned_by(first.poses, list(self.cameras.values()))
+        if off > TURNED:
+            log.warning(
+                "%s: the network's poses are turned by up to %.0f degrees from the cameras %s: if it saw the views in "
+                "another order, say so in multiview.json", self.about, off, ", ".join(self.cameras),
+            )  # fmt: skip
 
     def _against(self, number: int, first: Predicted) -> float:
         now = self._predicted(number).depth
