@@ -14,7 +14,7 @@ from tiny import make_model
 from d2_plugin.config import D2Config
 from d2_plugin.hooks.prior import PriorLoader, believed
 from d2_plugin.priors.summary import PriorSummary
-from d2_plugin.protocol import DepthPrior, Label, View
+from d2_plugin.protocol import DepthPrior, Label, RasterSettings, View
 from d2_plugin.recordings import Recording, open_recording
 from d2_plugin.runs.evaluation import still_image, what_moves
 from d2_plugin.runs.plan import Decision
@@ -27,6 +27,7 @@ from d2_plugin.runs.prior.trials import (
     left_out,
     small_prior,
 )
+from d2_plugin.runs.prior.trials import tried as make_trials
 from d2_plugin.runs.run import Run
 from d2_plugin.runs.settings import RunSettings
 from d2_plugin.runs.start import TimedPoints, with_stereo
@@ -290,6 +291,20 @@ def run_of(settings: RunSettings, folder: Path) -> Run:
     plan = replace(run.scene.plan, measured=both, mono_source="maps", mono_kind="relative")
     run.scene = replace(run.scene, plan=plan)
     return run
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e-3])
+def test_trials_draw_what_lies_before_the_near_plane(settings, tmp_path, tried, unit) -> None:
+    """A recording in kilometres: trials trained empty models, all alike, and so chose stereo."""
+    scene, cameras = run_of(settings, tmp_path / "run").scene, {}
+    for name, camera in scene.recording.cameras.items():
+        pose = camera.T_camera_world * np.array([1, 1, 1, unit])
+        pose[3, 3] = 1
+        cameras[name] = replace(camera, T_camera_world=pose, near_far=None)
+    scene = replace(scene, recording=replace(scene.recording, cameras=cameras))
+    make_trials(settings, scene, NO_POINTS, Path(settings.priors))
+    near = tried[0].overrides["backbone"].get("raster", {}).get("near", RasterSettings.near)
+    assert near == 0.2 if unit == 1 else near < 1e-3
 
 
 @pytest.mark.parametrize(

@@ -31,13 +31,13 @@ from d2_plugin.durable import CannotWrite, write_table
 from d2_plugin.hooks.prior import Belief, Store
 from d2_plugin.plugin import D2Hooks
 from d2_plugin.progress import progress_bar
-from d2_plugin.protocol import DepthPrior
+from d2_plugin.protocol import DepthPrior, RasterSettings
 from d2_plugin.recordings import open_recording
 from d2_plugin.runs.evaluation import still_image, what_moves
 from d2_plugin.runs.metrics import NO_DIFFERENCE, psnr, ssim_uniform
 from d2_plugin.runs.scene import Scene
 from d2_plugin.runs.settings import HOOK_NAMES, RunSettings, hook_config
-from d2_plugin.runs.start import TimedPoints, make_view, with_stereo
+from d2_plugin.runs.start import TimedPoints, make_view, scene_extent, with_stereo
 from d2_plugin.store.store import TRIALS, PriorStore
 
 LEAST_ITERATIONS = 300
@@ -58,7 +58,7 @@ CLEAR = 0.025
 """How far ahead in the sum either belief is where no further camera is needed, if the two or more so far agree."""
 DECIBEL = 0.02
 """What a decibel of PSNR counts beside SSIM: in full runs both rise together so."""
-NOTHING_GOES = {"backbone": {"dispensable": 0.0}}
+NOTHING_GOES = {"dispensable": 0.0}
 """What Gaussians are worth is a fifth of a trial's time, and hardly one goes in so few steps."""
 NO_MORE = "here no monocular map that was accepted says more than stereo, which alone is used"
 
@@ -147,7 +147,10 @@ def tried(settings: RunSettings, scene: Scene, points: TimedPoints, priors: Path
     store = PriorStore.open(priors)
     if (known := store.tried()) is not None:
         return known
-    plain = {name: table for name, table in settings.overrides.items() if name in ("plan", "priors")} | NOTHING_GOES
+    plain = {name: table for name, table in settings.overrides.items() if name in ("plan", "priors")}
+    middle = 2 * scene_extent(scene.recording, scene.train_cameras, points.positions).radius
+    near = {} if middle > RasterSettings.near else {"raster": {"near": 0.05 * middle}}  # else nothing would be drawn
+    plain |= {"backbone": NOTHING_GOES | near}
     own = replace(settings, backbone=RunSettings.backbone, hooks=HOOK_NAMES, seed=0, overrides=plain)
     trials = leave_out_in_turn(own, scene, points, store).as_dict()
     with contextlib.suppress(CannotWrite):  # a finished prior may lie where nobody can write
