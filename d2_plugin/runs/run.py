@@ -29,7 +29,7 @@ from d2_plugin.runs.rows import circumstances
 from d2_plugin.runs.scene import Guidance, Scene
 from d2_plugin.runs.settings import HOOK_NAMES, RunSettings, check, hook_config, hooks_in_use
 from d2_plugin.runs.shared import COST
-from d2_plugin.runs.start import FROM_STEREO, TimedPoints, triangulated_points, with_stereo
+from d2_plugin.runs.start import FROM_STEREO, TimedPoints, scene_extent, triangulated_points, with_stereo
 from d2_plugin.store.store import PriorStore
 from d2_plugin.values import checked_arguments
 
@@ -114,6 +114,7 @@ class Run:
         with self._writing(), self._timed("priors") as keep:
             points = self._points()
             keep()
+            _refuse_before_the_near_plane(self.settings, self.scene, points)
             if self.uses_prior:
                 between = "motion" in hooks_in_use(self.settings)
                 summary = build_priors_for(self.scene, points.positions, self._store, between=between, on_view=keep)
@@ -146,7 +147,6 @@ class Run:
         with self._writing():
             points = self.prepare(on_prior)
             trainer = self._trainer(points)
-            _refuse_before_the_near_plane(trainer.model)
             self._restore(trainer)
             watching = watch(trainer) if watch else lambda step, loss: None
             iterations = self.settings.iterations
@@ -294,10 +294,12 @@ class Run:
             keep()
 
 
-def _refuse_before_the_near_plane(model: Any) -> None:
-    """Refuse a scene most of which the rasterizer would not draw."""
-    raster = getattr(getattr(model, "settings", None), "raster", None)
-    near, median = getattr(raster, "near", 0.0), 2 * getattr(model, "extent", float("inf"))
+def _refuse_before_the_near_plane(settings: RunSettings, scene: Scene, points: TimedPoints) -> None:
+    """Refuse a scene most of which the rasterizer would not draw, before the prior takes its time."""
+    backbone: Any = registry.load(registry.BACKBONES, settings.backbone)
+    raster = getattr(backbone.settings_from(settings.overrides.get("backbone", {})), "raster", None)
+    near = getattr(raster, "near", 0.0)
+    median = 2 * scene_extent(scene.recording, scene.train_cameras, points.positions).radius
     if median <= near:
         raise D2Error(
             f"the cameras see most of the scene nearer than {median:.2g} and Gaussians nearer than {near:g} are not "

@@ -218,7 +218,8 @@ def test_a_scene_before_the_near_plane_is_refused(moving, tmp_path: Path) -> Non
         one.T_camera_world[3, 3] = 1
     path = save_recording(rig(select_frames(moving, [0]), *tiny), tmp_path / "scene")
     settings = RunSettings(str(path), tuple(PAIR), iterations=2, hooks=())
-    refuses("set `near = 0.0", Run(settings, tmp_path / "run").train)
+    refuses("set `near = 0.0", Run(replace(settings, hooks=("densify",)), tmp_path / "run").train)
+    assert not (tmp_path / "run" / "priors").exists(), "refused before the prior is built"
     Run(replace(settings, overrides={"backbone": {"raster": {"near": 2e-4}}}), tmp_path / "drawn").train()
 
 
