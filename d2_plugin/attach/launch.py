@@ -84,6 +84,11 @@ def parsed(arguments: Sequence[str]) -> tuple[argparse.Namespace, list[str]]:
     return options, command
 
 
+def _from_here(text: str) -> Path:
+    """The path in whatever folder the script goes on to work."""
+    return Path(text).expanduser().absolute()
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m d2_plugin.attach",
@@ -91,8 +96,10 @@ def _parser() -> argparse.ArgumentParser:
         description="Run another repository's train.py with D2 attached, no line of it edited.",
     )
     parser.add_argument("repository", choices=sorted(RECIPES), help="which codebase the script belongs to")
-    parser.add_argument("--d2", type=Path, default=None, help="configuration of D2; without it the bare trainer runs")
-    parser.add_argument("--exported", type=Path, help="what d2 export-recording wrote, if the prior is of its source")
+    parser.add_argument("--d2", type=_from_here, help="configuration of D2; without it the bare trainer runs")
+    parser.add_argument(
+        "--exported", type=_from_here, help="what d2 export-recording wrote, if the prior is of its source"
+    )
     device = parser.add_mutually_exclusive_group()
     device.add_argument("--cpu", action="store_true", help="cuda means cpu, and D2's modules replace CUDA builds")
     device.add_argument("--stand-ins", action="store_true", help="on a GPU, too, they replace what cannot be loaded")

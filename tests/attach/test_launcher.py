@@ -202,6 +202,11 @@ class TestCommand:
             assert main(["fudan", "--", str(tmp_path / "train.py")]) == 0
         assert ended == ends
 
+    def test_a_script_may_go_to_another_folder(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.chdir(tmp_path)
+        options, _ = launch.parsed(["fudan", "--d2", "d2.toml", "--exported", "data", "--", "train.py"])
+        assert (options.d2, options.exported) == (tmp_path / "d2.toml", tmp_path / "data")
+
     def test_without_a_gpu_the_cpu_has_to_be_asked_for(self, tmp_path: Path, monkeypatch, capsys) -> None:
         monkeypatch.setattr(launch.torch.cuda, "is_available", lambda: False)
         (tmp_path / "train.py").touch()
