@@ -152,4 +152,6 @@ def test_without_a_camera_held_out_nothing_is_trained(saved_room, tmp_path, refu
     room = saved_room(cameras=2, held_out=1, frames=2, width=96, height=54)
     said = refused("ablate", str(room), "--train-cameras", "all", "--output", str(tmp_path / "out"))
     assert "leave one out of --train-cameras" in said
+    said = refused("bench", "training", f"{room}@all", "--output", str(tmp_path / "out"))
+    assert "@all' train, so no run can be scored: leave one out" in said
     assert not (tmp_path / "out").exists()

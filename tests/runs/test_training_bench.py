@@ -54,7 +54,7 @@ class TestCases:
         assert case.settings.test_cameras == ("01", "03")
         assert timed.case_of("studio@00", SETTINGS).settings.test_cameras is None
 
-    @pytest.mark.parametrize("text", ["studio", "@00", "a@b@c@d", ""])
+    @pytest.mark.parametrize("text", ["studio", "@00", "a@b@c@d", "", "studio@", "studio@+"])
     def test_a_recording_without_cameras_is_refused_with_an_example(self, text: str) -> None:
         refuses("PATH@00", timed.case_of, text, SETTINGS)
 

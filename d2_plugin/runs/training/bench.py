@@ -23,7 +23,8 @@ from d2_plugin.reading import read_toml
 from d2_plugin.recordings.presets import resolve_cameras, split_name
 from d2_plugin.runs.ablation.presets import PRESETS, TABLES, Preset, rows_named
 from d2_plugin.runs.rows import TRY, Row, case_name, command_line
-from d2_plugin.runs.settings import RunSettings
+from d2_plugin.runs.scene import Scene
+from d2_plugin.runs.settings import RunSettings, check
 from d2_plugin.runs.shared import Shared, share, share_points
 from d2_plugin.runs.training.measured import Line, Work, by_key, follow, rows_in, unmeasured, workers, written
 from d2_plugin.settings import AtATime, Count, Downscale, Positional, Range, Seed, Settings
@@ -126,7 +127,7 @@ def case_of(text: str, base: RunSettings) -> Case:
         D2Error: no cameras, or more than two groups of them.
     """
     path, *groups = text.split("@")
-    if not path or not 1 <= len(groups) <= 2:
+    if not path or not 1 <= len(groups) <= 2 or not groups[0].strip("+"):
         raise D2Error(
             f"'{text}' names no cameras to train with: write PATH@00+02+05+07, or PATH@00+02@01+03 to say as well "
             "which ones score"
@@ -159,6 +160,8 @@ def _lines(
     tables = {} if settings.config is None else read_toml(settings.config, "write TOML tables, or leave out --config")
     base = RunSettings("", (), **{n: getattr(settings, n) for n in shown}, overrides=tables)
     case = case_of(text, base)
+    if not Scene.open(check(case.settings)).test_cameras:
+        raise D2Error(f"all cameras of '{text}' train, so no run can be scored: leave one out")
     folder = settings.output.absolute() / case.slug
     cluster = None if settings.scheduler is None else {"scheduler": settings.scheduler}
     for preset in presets:
