@@ -11,6 +11,7 @@ from typing import Any
 
 from d2_plugin.durable import Kind, make_folder, read_table, write_table
 from d2_plugin.errors import D2Error
+from d2_plugin.locks import only_writer
 from d2_plugin.priors.frame import view_digest
 from d2_plugin.recordings import open_recording
 from d2_plugin.runs.prior.build import build_priors_for
@@ -98,15 +99,15 @@ def _finished(made: Path) -> bool:
 @contextmanager
 def _timed(made: Path, clock: Callable[[], float] = time.process_time, **more: Any) -> Iterator[Callable[[], None]]:
     """Record beside what is made in the block how long it took to the last call of what this gives, which keeps it."""
-    make_folder(made.parent)
-    record, start = _record(made), clock()
-    before = read_table(record, COST)["seconds"] if record.is_file() else None if made.exists() else 0.0
-    table = {"seconds": before, **more}
+    with only_writer(make_folder(made.parent)):  # two that share the work would each count a part of it
+        record, start = _record(made), clock()
+        before = read_table(record, COST)["seconds"] if record.is_file() else None if made.exists() else 0.0
+        table = {"seconds": before, **more}
 
-    def keep() -> None:
-        table["seconds"] = None if before is None else before + clock() - start
-        write_table(record, table | {"unfinished": True}, COST)
+        def keep() -> None:
+            table["seconds"] = None if before is None else before + clock() - start
+            write_table(record, table | {"unfinished": True}, COST)
 
-    keep()
-    yield keep
-    write_table(record, table, COST)
+        keep()
+        yield keep
+        write_table(record, table, COST)

@@ -211,6 +211,12 @@ class TestThePriorOfARun:
         second.side_effect = None
         assert share(settings, tmp_path).seconds > points + first
 
+    def test_a_shared_one_that_another_process_makes_is_not_counted_in_part(self, scene, tmp_path) -> None:
+        settings = RunSettings(str(scene), ("train0",))
+        with only_writer(tmp_path):
+            refuses("another process is writing", share, settings, tmp_path)
+        share(settings, tmp_path)
+
 
 def test_a_run_whose_prior_is_empty_goes_on_as_its_refusal_proposes(scene, tmp_path) -> None:
     settings = RunSettings(str(scene), ("train0",), iterations=2, hooks=("depth_loss",))
