@@ -339,6 +339,16 @@ def test_frames_that_are_not_there_and_views_in_another_order_are_named(room, ma
     )
 
 
+def test_maps_without_any_depth_or_confidence_are_named(room: Recording, tmp_path: Path, caplog) -> None:
+    def unsure(arrays: dict[str, np.ndarray], frame: int) -> None:
+        arrays["conf"] = -arrays["conf"]
+
+    maps = write_multiview(room, NAMES, tmp_path / "maps", turned=unsure)
+    read = partial(Frame.read, room, NAMES)
+    MultiviewSource(room, NAMES, replace(ALONE, multiview=str(maps)), tmp_path / "cache", read).views(read(0))
+    assert "frames 0, 1 have no pixel with depth and confidence above 0" in caplog.text
+
+
 def test_the_cameras_that_the_network_saw_may_be_more_and_in_another_order(room, maps, tmp_path) -> None:
     other = write_multiview(room, ["train2", "train0", "train1"], tmp_path / "maps", posed=True)
     (other / "multiview.json").write_text('{"cameras": ["train2", "train0", "train1"], "emulated": true}')

@@ -159,8 +159,11 @@ class MultiviewSource:
             return 1.0
         if self._scale is None:
             there = [frame for frame in self.frames if self.has(frame)]
-            first = self._predicted(there[0])
-            logs = np.array([self._measured(frame, first) for frame in spread(there, SCALED_AT)])
+            first, some = self._predicted(there[0]), spread(there, SCALED_AT)
+            if not any(np.isfinite(self._predicted(frame).depth).any() for frame in some):
+                looked = ", ".join(map(str, some))
+                log.warning("%s: frames %s have no pixel with depth and confidence above 0", self.about, looked)
+            logs = np.array([self._measured(frame, first) for frame in some])
             logs = logs[np.isfinite(logs)]
             self._scale = float(np.median(logs)) if logs.size else 0.0, first
             self._name_other_order(first)
