@@ -108,20 +108,22 @@ def _beside(known: Tensor, depth: Tensor, places: Tensor, reach: float) -> Tenso
     """Depth [C] at `places` [C, 2]: on the plane through the nearest of the `known` [K, 2], where they lie on one, else
     that of the nearest; NaN where that is farther than `reach`."""
     apart, nearest = torch.cdist(places, known).topk(min(NEIGHBOURS, len(known)), largest=False)
+    near = apart[:, 0] < reach
+    nearest, beside = nearest[near], torch.full_like(apart[:, 0], torch.nan)
     inverse = 1 / depth[nearest]  # affine in the image, of a plane
-    towards = known[nearest] - places[:, None]
+    towards = known[nearest] - places[near][:, None]
     design = torch.cat([torch.ones_like(towards[..., :1]), towards], -1)
     weights, slight = torch.ones_like(inverse), 1e-3 * torch.diag(design.new_tensor([0.0, 1, 1]))
     for _ in range(FITS):
         weighted = (design * weights[..., None]).transpose(1, 2)
-        plane = torch.linalg.solve(weighted @ design + slight, weighted @ inverse[..., None])
+        plane = torch.linalg.solve_ex(weighted @ design + slight, weighted @ inverse[..., None]).result
         off = (design @ plane)[..., 0] / inverse - 1
         scatter = 1.48 * off.abs().median(1).values
         weights = (1 + (off / (2 * scatter.clamp(min=SCATTER / 10)[:, None])) ** 2) ** -2
     least, most = inverse.aminmax(dim=1)
     carried = 1 / plane[:, 0, 0].clamp(least / BEYOND, most * BEYOND)
-    carried = torch.where(scatter < SCATTER, carried, depth[nearest[:, 0]])
-    return torch.where(apart[:, 0] < reach, carried, torch.nan)
+    beside[near] = torch.where(scatter < SCATTER, carried, depth[nearest[:, 0]])
+    return beside
 
 
 class CarriedOn:

@@ -175,6 +175,18 @@ def test_what_lies_on_no_plane_goes_on_as_far_away_as_next_to_it() -> None:
     assert float(off.max()) < 0.1
 
 
+@pytest.mark.parametrize("known", [slice(0, 2), slice(0, 12)])
+@pytest.mark.parametrize("unit", [1e-6, 1e6])
+def test_little_that_is_known_lays_a_plane_or_none_and_nothing_fails(known: slice, unit: float) -> None:
+    """One column of blocks, and six, from which planes to the other end of the image are ill-posed; a noisy wall."""
+    noise = torch.rand(SIZE[1], SIZE[0], generator=torch.Generator().manual_seed(0))
+    own = prior(camera("right", 0.4, unit), unit, known)
+    own = own._replace(depth=own.depth * (1 + 0.2 * noise))
+    away = camera("away", -9.0, unit)
+    found = carried_on(own, (away, prior(away, unit)), unit=unit)
+    assert ((found.depth == 0) | ((found.depth > 0.9 * WALL * unit) & (found.depth < 1.6 * WALL * unit))).all()
+
+
 def test_depth_is_carried_on_for_a_tenth_of_the_image_at_most() -> None:
     away = camera("away", -9.0)
     found = carried_on(prior(LEFT, known=slice(0, 48)), (away, prior(away)))

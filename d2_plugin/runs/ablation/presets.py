@@ -55,6 +55,7 @@ PRESETS: dict[str, Preset] = {
         Preset("no_rgbd", "w/o RGB-D", _without("depth_loss")),
         Preset("no_motion", "w/o motion", _without("motion")),
         Preset("no_parallax", "w/o parallax", _without("parallax")),
+        Preset("no_carrying_on", "nothing carried on", overrides={"densify": {"carry_on": False}}),
         Preset("motion_by_loss", "motion by the loss only", overrides={"motion": {"insert": False}}),
         Preset("motion_by_insertion", "motion at insertion only", overrides={"motion": {"weight": 0.0}}),
         Preset("full", "D²-4DGS"),
@@ -76,6 +77,7 @@ TABLES: dict[str, tuple[str, ...]] = {
     ),
     "motion": ("no_motion", "motion_by_insertion", "motion_by_loss", "full"),
     "parallax": ("no_parallax", "full"),
+    "carrying_on": ("no_carrying_on", "full"),
     "pruning": ("no_pruning", "opacity_only", "depth_only", "full"),
     "main": ("backbone", "full"),
 }
