@@ -22,13 +22,14 @@ from d2_plugin.priors.monocular.far import far_pixels
 from d2_plugin.priors.monocular.uncertainty import Skill, Uncertainty, monocular_uncertainty
 from d2_plugin.priors.multiview.fit import UNSEEN, Vote, fitted, voted
 from d2_plugin.priors.multiview.source import MultiviewMap
+from d2_plugin.priors.other_colors import without_other_colors
 from d2_plugin.priors.settings import PriorSettings
 from d2_plugin.priors.stereo.filtering.filter import GeometricDepth
 from d2_plugin.protocol import Label
 from d2_plugin.recordings.recording import Camera, MonoKind
 from d2_plugin.store.maps import FusedPrior, empty_prior
 
-CONSTRUCTION_VERSION = 18  # raise it when alignment or fusion change what they return
+CONSTRUCTION_VERSION = 19  # raise it when alignment or fusion change what they return
 
 FARTHEST = 3.0
 """Aligned monocular depth beyond this multiple of the 99.5 percentile of the anchors is left empty."""
@@ -86,7 +87,15 @@ class ViewPrior:
 
 def compares_cameras(settings: PriorSettings, cameras: int, measured: bool) -> bool:
     """Whether the prior of one camera depends on those of the others; `measured` by stereo or from several views."""
-    return settings.agreement > 0 and settings.variant == "dual" and measured and cameras > 1
+    return measured and cameras > 1 and (_compares_maps(settings) or _compares_colors(settings))
+
+
+def _compares_maps(settings: PriorSettings) -> bool:
+    return settings.agreement > 0 and settings.variant == "dual"
+
+
+def _compares_colors(settings: PriorSettings) -> bool:
+    return settings.color_limit > 0 and settings.variant != "mono"
 
 
 def construct(
@@ -103,7 +112,8 @@ def construct(
     prepared = {name: _Prepared.of(view, cameras[name], settings, kind) for name, view in views.items()}
     measured = any(view.geometric is not None or view.multiview is not None for view in views.values())
     compared = compares_cameras(settings, len(cameras), measured)
-    if compared and settings.align.across and kind is not None:
+    compares_maps = compared and _compares_maps(settings)
+    if compares_maps and settings.align.across and kind is not None:
         shown = {
             name: Shown(cameras[name], view.prediction, view.depth, view.alignment)
             for name, view in prepared.items()
@@ -113,9 +123,11 @@ def construct(
             prepared[name] = replace(prepared[name], alignment=alignment)
     several = _of_several_views(prepared, cameras, settings)
     priors = {name: _view_prior(view, several.get(name), settings) for name, view in prepared.items()}
-    if not compared:
-        return priors
     maps = {name: prior.maps for name, prior in priors.items()}
+    if compared and _compares_colors(settings):
+        maps = without_other_colors(maps, cameras, settings.color_limit)
+    if not compares_maps:
+        return {name: replace(prior, maps=maps[name]) for name, prior in priors.items()}
     tails = {name: prior.skill.tail for name, prior in priors.items() if prior.skill is not None}
     unmeasured = any(
         prior.several and (prior.several["skill"] or {}).get("scale", 0) is None for prior in priors.values()

@@ -58,6 +58,9 @@ class PriorSettings(Settings):
     agreement: Relative = 0.02
     """Two cameras' monocular depths agree within this share (`dual` alone). 0 leaves the other cameras out, as in the
     paper: they neither confirm nor contradict a mono-only pixel (`d2_plugin.priors.evidence`)."""
+    color_limit: Share = 0.04
+    """A verified pixel is left empty whose colour is off by more than this share of white from what each camera that
+    knows the same depth shows there: it has the depth of what lies behind. 0 compares no colours, as in the paper."""
     far: bool = True
     """Find sky and what lies beyond any parallax (`dual` alone); off, as in the paper, they are like all others."""
     between: bool = True
@@ -98,5 +101,6 @@ class PriorSettings(Settings):
         each camera for itself, depth read at pixels."""
         align = AlignSettings(residual="absolute", epsilon=0.01, local_correction=False, across=False)
         changes["stereo"] = replace(changes.get("stereo", StereoSettings()), between_pixels=False)
-        changes |= {"uncertainty": False, "hanging_limit": 0.0, "agreement": 0.0, "far": False, "between": False}
+        changes |= {"uncertainty": False, "hanging_limit": 0.0, "agreement": 0.0}
+        changes |= {"color_limit": 0.0, "far": False, "between": False}
         return cls(align=align, **changes)
