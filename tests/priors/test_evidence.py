@@ -124,7 +124,7 @@ def test_cameras_are_compared_for_the_dual_prior_alone(tmp_path: Path) -> None:
         store = PriorStore.open(tmp_path)
         return np.stack([store.prior(name, recording.frames[0]).labels.numpy() for name in names])
 
-    with_it, without = labels(PriorSettings()), labels(PriorSettings(agreement=0.0))
+    with_it, without = (labels(PriorSettings(agreement=share, color_limit=0.0)) for share in (0.02, 0.0))
     assert (with_it == Label.AGREED).any()
     changed = with_it != without
     assert set(np.unique(without[changed])) <= {Label.MONO, Label.EMPTY}, "what stereo says for itself never changes"
