@@ -135,15 +135,18 @@ class CarriedOn:
     def __call__(self, prior: DepthPrior, view: View, context: Context, still: Tensor | None) -> DepthPrior:
         """The prior of a view with depth where it has none, nothing moves and no other camera looks.
 
-        It stays as it is where cameras move, and where there are fewer than `LEAST_CAMERAS`.
+        It stays as it is where cameras move, where there are fewer than `LEAST_CAMERAS`, and where a network's depth is
+        believed: that fills what it can.
 
         Args:
             prior: what is believed of it.
             still: where nothing moves, bool [H, W]; None where that is not known.
         """
         others = [other for other in context.beside(view) if other.camera != view.camera]
+        if len(others) + 1 < LEAST_CAMERAS or (prior.support & (prior.labels != Label.VERIFIED)).any():
+            return prior
         own = Blocks.of(view, prior)
-        if len(others) + 1 < LEAST_CAMERAS or not torch.isfinite(own.depth).any():
+        if not torch.isfinite(own.depth).any():
             return prior
         carried, surface = torch.isfinite(own.depth) & ~self._before(view, context), own.surface()
         for other in others:

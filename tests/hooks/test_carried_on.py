@@ -145,6 +145,8 @@ def test_what_moves_and_what_is_far_is_left_alone() -> None:
 
 
 def test_where_nothing_can_be_said_the_prior_stays_as_it_is() -> None:
+    filled = REST._replace(labels=REST.labels.masked_fill(torch.eye(60, 96) > 0, int(Label.MONO)))
+    assert carried_on(filled, (LEFT, prior(LEFT))) is filled, "a network's depth fills what it can"
     nothing = prior(LEFT, known=slice(0, 0))
     known = ViewSampler()
     known.add(camera("right", 0.4))
