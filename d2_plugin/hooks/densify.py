@@ -76,8 +76,8 @@ class DensifyConfig(HookConfig):
     opacity: Annotated[float, Range(1e-6, 1)] = 0.1
     """Opacity of a new Gaussian. A faint one cannot spoil what stands; training makes it opaque where it is right."""
     carry_on: bool = True
-    """Whether what one camera alone sees gets the depth of what is known beside it, see `d2_plugin.hooks.carried_on`;
-    the paper has no such depth."""
+    """Whether what one camera alone sees gets the depth of what is known beside it where stereo alone is believed, see
+    `d2_plugin.hooks.carried_on`; the paper has no such depth."""
     lifetime: Positive | None = 1.0
     """Standard deviation in time of a new Gaussian where the image moves, in intervals from instant to instant, in a
     backbone that has one; none: as it begins there. New ones stand still."""
