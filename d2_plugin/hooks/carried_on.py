@@ -37,8 +37,6 @@ BEYOND = 1.25
 """How many times nearer or farther than all of those blocks the plane may run."""
 FITS = 3
 """Times that it is laid, with less weight on what lay far from the last one."""
-LEAST_CAMERAS = 3
-"""Of two, each sees much of what there is alone, and one can look through little of the space."""
 INSTANTS = 5
 """At how many of a camera's instants others have to look through the space: a person there is not matched at each."""
 NEAREST = 0.2
@@ -135,15 +133,14 @@ class CarriedOn:
     def __call__(self, prior: DepthPrior, view: View, context: Context, still: Tensor | None) -> DepthPrior:
         """The prior of a view with depth where it has none, nothing moves and no other camera looks.
 
-        It stays as it is where cameras move, where there are fewer than `LEAST_CAMERAS`, and where a network's depth is
-        believed: that fills what it can.
+        It stays as it is where cameras move, and where a network's depth is believed, which fills what it can.
 
         Args:
             prior: what is believed of it.
             still: where nothing moves, bool [H, W]; None where that is not known.
         """
         others = [other for other in context.beside(view) if other.camera != view.camera]
-        if len(others) + 1 < LEAST_CAMERAS or (prior.support & (prior.labels != Label.VERIFIED)).any():
+        if not others or (prior.support & (prior.labels != Label.VERIFIED)).any():
             return prior
         own = Blocks.of(view, prior)
         if not torch.isfinite(own.depth).any():

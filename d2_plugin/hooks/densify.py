@@ -6,17 +6,19 @@ import logging
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import torch
 from torch import Tensor
 
-from d2_plugin.hooks.carried_on import CarriedOn
 from d2_plugin.hooks.expected import check_splats
 from d2_plugin.hooks.hook import Context, Hook, HookConfig, Surveyed
 from d2_plugin.hooks.views import back_project
 from d2_plugin.protocol import DepthPrior, Edit, Label, Points, Splats, View
 from d2_plugin.settings import Count, Every, Positive, Range, Share, Steps
+
+if TYPE_CHECKING:
+    from d2_plugin.hooks.carried_on import CarriedOn
 
 log = logging.getLogger(__name__)
 
@@ -43,6 +45,9 @@ CANDIDATES = 8
 
 MOST = 1_000_000
 """Gaussians up to which there is insertion, where `max_gaussians` is not set."""
+
+LEAST_CAMERAS = 3
+"""From which on depth is carried on: of two, each sees much alone, and one looks through little of the space."""
 
 MOST_MOVING = 0.5
 """Where more of an image differs, it is the light or the camera that changes, and nothing is known."""
@@ -196,7 +201,8 @@ class Densify(Hook):
 
     def __init__(self, config: DensifyConfig) -> None:
         super().__init__(config)
-        self._moving, self._carry_on = MovingPixels(), CarriedOn()
+        self._moving = MovingPixels()
+        self._carry_on: CarriedOn | None = None
         self._full = False
 
     def edit(self, context: Context) -> Edit | None:
@@ -251,8 +257,12 @@ class Densify(Hook):
     def _carried_on(self, surveyed: Surveyed, context: Context) -> tuple[Surveyed, Tensor | None]:
         """A view, its prior carried on to what its camera alone sees; and `_lifetimes` of its pixels."""
         lives = self._lifetimes(surveyed.view, context)
-        if not self.config.carry_on:
+        if not self.config.carry_on or len(context.beside(surveyed.view)) < LEAST_CAMERAS:
             return surveyed, lives
+        if self._carry_on is None:
+            from d2_plugin.hooks.carried_on import CarriedOn  # most trainers never get here
+
+            self._carry_on = CarriedOn()
         still = None if lives is None else torch.isinf(lives)
         return surveyed._replace(prior=self._carry_on(surveyed.prior, surveyed.view, context, still)), lives
 

@@ -148,11 +148,6 @@ def test_where_nothing_can_be_said_the_prior_stays_as_it_is() -> None:
     filled = REST._replace(labels=REST.labels.masked_fill(torch.eye(60, 96) > 0, int(Label.MONO)))
     assert carried_on(filled, (LEFT, prior(LEFT))) is filled, "a network's depth fills what it can"
     nothing = prior(LEFT, known=slice(0, 0))
-    known = ViewSampler()
-    known.add(camera("right", 0.4))
-    known.add(LEFT)
-    two = given(known, {"right": REST, "left": prior(LEFT)})
-    assert CarriedOn()(REST, camera("right", 0.4), two, None) is REST
     assert carried_on(nothing, (LEFT, prior(LEFT))) is nothing
     flawed = REST._replace(depth=REST.depth.masked_fill(REST.depth > 0, torch.nan))
     assert carried_on(flawed, (LEFT, prior(LEFT))) is flawed
@@ -196,9 +191,11 @@ def test_depth_is_carried_on_for_a_tenth_of_the_image_at_most() -> None:
     assert 48 + 6 <= int(columns.max()) <= 48 + 10
 
 
-@pytest.mark.parametrize(("carry_on", "moves"), [(True, False), (False, False), (True, True)])
-def test_densify_inserts_there_unless_a_camera_moves_or_it_is_switched_off(carry_on: bool, moves: bool) -> None:
-    views = [camera("right", 0.4), LEFT, replace(LEFT, camera="behind", T_camera_world=AWAY)]
+@pytest.mark.parametrize(
+    ("carry_on", "moves", "cameras"), [(True, False, 3), (False, False, 3), (True, True, 3), (True, False, 2)]
+)
+def test_densify_inserts_there_with_three_cameras_that_stand_still(carry_on: bool, moves: bool, cameras: int) -> None:
+    views = [camera("right", 0.4), LEFT, replace(LEFT, camera="behind", T_camera_world=AWAY)][:cameras]
     known = ViewSampler()
     for view in [*views, *([replace(camera("left", 0.1), frame=1)] if moves else [])]:
         known.add(view)
@@ -210,5 +207,5 @@ def test_densify_inserts_there_unless_a_camera_moves_or_it_is_switched_off(carry
     edit = Densify(DensifyConfig(carry_on=carry_on)).edit(context)
     assert edit is not None
     assert edit.insert is not None
-    assert bool((edit.insert.positions[:, 0] > 2.6).any()) == (carry_on and not moves)
+    assert bool((edit.insert.positions[:, 0] > 2.6).any()) == (carry_on and not moves and cameras == 3)
     torch.testing.assert_close(edit.insert.positions[:, 2], torch.full_like(edit.insert.positions[:, 2], WALL))
