@@ -41,7 +41,7 @@ def without_other_colors(
             continue
         points = cameras[name].world(np.stack([columns, rows], -1) + 0.5, prior.depth[rows, columns])
         color, least = image[rows, columns].astype(np.float32), np.full(len(rows), np.inf, np.float32)
-        for other in images.keys() - {name}:
+        for other in (other for other in images if other != name):
             pixels, depths, seen = projected(cameras[other], points)
             shown = np.flatnonzero(seen)
             across, down = pixels[shown].astype(int).T
