@@ -222,7 +222,7 @@ class _Sources:
             asdict(settings.align),
             None if self.geometric is None else self.geometric.key(frame),
             None if self.multiview is None else self.multiview.key(frame),
-            [settings.agreement, *maps.values()] if self.compared else None,
+            [settings.agreement, settings.color_limit, *maps.values()] if self.compared else None,
         )
         return {name: hash_of(*common, maps.get(name)) for name in self.cameras}
 

@@ -169,6 +169,15 @@ def test_other_fusion_settings_reuse_the_stereo_cache(plain, begun, monkeypatch,
     assert loose.shares["train0"]["mono"] == strict.shares["train0"]["mono"]
 
 
+def test_every_setting_of_the_construction_fuses_anew(plain: Recording, begun: Path, monkeypatch) -> None:
+    no_stereo(monkeypatch)
+    changes = {"conflict_sigmas": 2.0, "most_vetoed": 0.5, "tau_c": 0.2, "hanging_limit": 0.0, "color_limit": 0.0}
+    settings = SETTINGS
+    for name, value in (changes | {"agreement": 0.0, "far": False, "uncertainty": False, "variant": "mvs"}).items():
+        settings = replace(settings, **{name: value})
+        assert build_priors(plain, NAMES, begun, settings).built == 6, name
+
+
 def test_a_changed_image_rebuilds_its_timestamp_and_no_other(plain: Recording, begun: Path, caplog) -> None:
     def image(camera: str, frame: int) -> np.ndarray:
         image = plain.image(camera, frame)
