@@ -218,7 +218,7 @@ class _Sources:
             CONSTRUCTION_VERSION,
             settings.variant,
             [settings.uncertainty, settings.conflict_sigmas, settings.most_vetoed, settings.tau_c],
-            [settings.hanging_limit, settings.far, settings.mono_along],
+            [settings.hanging_limit, settings.far, self.kind, settings.mono_along],
             asdict(settings.align),
             None if self.geometric is None else self.geometric.key(frame),
             None if self.multiview is None else self.multiview.key(frame),

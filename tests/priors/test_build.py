@@ -178,6 +178,10 @@ def test_every_setting_of_the_construction_fuses_anew(plain: Recording, begun: P
         assert build_priors(plain, NAMES, begun, settings).built == 6, name
 
 
+def test_maps_that_are_declared_to_be_of_another_kind_are_fused_anew(plain: Recording, begun: Path) -> None:
+    assert build_priors(replace(plain, mono_kind="metric"), NAMES, begun, SETTINGS).built == 6
+
+
 def test_a_changed_image_rebuilds_its_timestamp_and_no_other(plain: Recording, begun: Path, caplog) -> None:
     def image(camera: str, frame: int) -> np.ndarray:
         image = plain.image(camera, frame)
