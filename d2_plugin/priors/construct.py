@@ -29,7 +29,7 @@ from d2_plugin.protocol import Label
 from d2_plugin.recordings.recording import Camera, MonoKind
 from d2_plugin.store.maps import FusedPrior, empty_prior
 
-CONSTRUCTION_VERSION = 19  # raise it when alignment or fusion change what they return
+CONSTRUCTION_VERSION = 20  # raise it when alignment or fusion change what they return
 
 FARTHEST = 3.0
 """Aligned monocular depth beyond this multiple of the 99.5 percentile of the anchors is left empty."""

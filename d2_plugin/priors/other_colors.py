@@ -18,6 +18,9 @@ from d2_plugin.recordings.images import opencv
 from d2_plugin.recordings.recording import Camera
 from d2_plugin.store.maps import FusedPrior
 
+MOST, TIMES = 0.9, 4.0
+"""Cameras differ by more than exposure: another colour is off by four times what nine tenths of a view's pixels are."""
+
 
 def without_other_colors(
     priors: Mapping[str, FusedPrior], cameras: Mapping[str, Camera], limit: float
@@ -28,7 +31,7 @@ def without_other_colors(
         priors: D* of synchronized views, by camera.
         cameras: their calibrations.
         limit: how far a colour (0..1, mean of the channels) may lie outside of those of 3x3 pixels of the other
-            camera, by whose exposure it is changed.
+            camera, by whose exposure it is changed; more where a tenth of a view's colours lie far outside.
     """
     cv2, square = opencv("the colours of stereo"), np.ones((3, 3), np.uint8)
     images = {name: prior.colors for name, prior in priors.items() if prior.colors is not None}
@@ -52,8 +55,10 @@ def without_other_colors(
             low, high = (bound[down, across] for bound in ranges[other])
             outside = np.fmax(np.fmax(low - ours, ours - high), 0).mean(1) / 255
             least[shown] = np.fmin(least[shown], outside)
+        compared = np.isfinite(least)
+        usual = np.quantile(least[compared], MOST) if compared.any() else 0.0
         gone = np.zeros(prior.labels.shape, bool)
-        gone[rows, columns] = np.isfinite(least) & (least > limit)
+        gone[rows, columns] = compared & (least > max(limit, TIMES * usual))
         found[name] = replace(
             prior,
             labels=np.where(gone, np.uint8(Label.EMPTY), prior.labels),

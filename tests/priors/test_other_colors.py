@@ -61,6 +61,16 @@ def test_a_pole_with_its_own_depth_keeps_it(exposure: float) -> None:
         assert (found.labels == Label.VERIFIED).all(), name
 
 
+def test_where_cameras_differ_by_more_than_exposure_a_colour_must_be_farther_off() -> None:
+    given = views(WALL)
+    colors = given["right"].colors.copy()
+    colors[: HEIGHT // 3] += 12  # as a real camera's do that sees the light there at another angle
+    given["right"] = replace(given["right"], colors=colors)
+    found = without_other_colors(given, CAMERAS, LIMIT)["left"]
+    assert (found.labels[:, 40:42] == Label.EMPTY).all()
+    np.testing.assert_array_equal(np.delete(found.labels, [40, 41], 1), np.uint8(Label.VERIFIED))
+
+
 def test_what_no_other_camera_knows_cannot_be_told() -> None:
     given = views(WALL)
     given["right"] = replace(given["right"], depth=0 * given["right"].depth, labels=0 * given["right"].labels)
