@@ -32,6 +32,20 @@ def mean_network(
     return path
 
 
+def flow_network(path: Path, height: int | str, width: int | str, dtype: int = FLOAT, whole: bool = True) -> Path:
+    """A network of two images that returns the means of both, and, if `whole`, of their channels at each pixel."""
+    images = ("first", "second")
+    steps = [_node("ReduceMean", [name], [f"mean {name}"], axes=[1], keepdims=1) for name in images]
+    steps.append(_node("Concat", [f"mean {name}" for name in images], ["flow"], axis=1))
+    steps.append(_node("GlobalAveragePool", ["flow"], ["coarse"]))
+    graph = b"".join(_message(1, step) for step in steps) + _text(2, "flow")
+    graph += b"".join(_message(11, _value(name, dtype, [1, 3, height, width])) for name in images)
+    graph += _message(12, _value("coarse", dtype, [1, 2, 1, 1]))
+    graph += _message(12, _value("flow", dtype, [1, 2, height, width])) if whole else b""
+    path.write_bytes(_varint(1, 8) + _message(7, graph) + _message(8, _text(1, "") + _varint(2, 13)))
+    return path
+
+
 def scaled_network(path: Path, weights: str) -> Path:
     """A network whose output [1, 3, 6, 8] is the image times a number that lies in the file `weights` beside it."""
     entry = b"".join(

@@ -14,7 +14,7 @@ import functools
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -36,9 +36,12 @@ from d2_plugin.protocol import DepthPrior, Label
 from d2_plugin.recordings.images import opencv
 from d2_plugin.recordings.recording import Camera
 from d2_plugin.recordings.selection import spread
-from d2_plugin.store.files import hash_of
+from d2_plugin.store.files import EntryFolder, hash_of
 from d2_plugin.store.maps import FusedPrior, empty_prior
 from d2_plugin.store.store import QUARTERS, PriorStore
+
+if TYPE_CHECKING:
+    from d2_plugin.priors.flow_network import FlowNetwork
 
 VERSION = 5
 """Of what is made from the same priors; raise it when that changes."""
@@ -66,11 +69,13 @@ SURE = 2
 Pair = tuple[np.ndarray, np.ndarray]
 
 
-def build_between(store: PriorStore, progress: Callable[[int], None] = lambda done: None) -> int:
+def build_between(
+    store: PriorStore, progress: Callable[[int], None] = lambda done: None, network: FlowNetwork | None = None
+) -> int:
     """Make what is missing of the instants between those of a store; after how many views they were made now.
 
     Nothing is made while a prior is missing, or where there are fewer than three frames. `progress` is called with the
-    number of views that are done.
+    number of views that are done. Dense flow is that of `network`, or OpenCV's.
 
     Raises:
         CannotWrite: the disk is full, broken or not ours.
@@ -78,12 +83,13 @@ def build_between(store: PriorStore, progress: Callable[[int], None] = lambda do
     records = {(camera, frame): store.record(camera, frame) for camera in store.cameras for frame in store.frames}
     if len(store.frames) < 3 or None in records.values():
         return 0
-    key = hash_of(VERSION, [[camera, frame, record["key"]] for (camera, frame), record in records.items() if record])
+    made = [[camera, frame, record["key"]] for (camera, frame), record in records.items() if record]
+    key = hash_of(VERSION, made, *([] if network is None else [network.fingerprint]))
     pairs = list(zip(store.frames, store.frames[1:]))
     entries = itertools.product(store.between.values(), store.cameras, store.frames[:-1])
     if all(folder.find_current(camera, first, key) for folder, camera, first in entries):
         return 0
-    cameras = [CameraMotion(store, name) for name in store.cameras]
+    cameras = [CameraMotion(store, name, network) for name in store.cameras]
     acceleration = follow(cameras) if cameras[0].even else None
     done = 0
     with store.building():
@@ -150,8 +156,8 @@ class _Interval(NamedTuple):
 class CameraMotion:
     """One camera of a store, and the regions that dense flow loses in each interval."""
 
-    def __init__(self, store: PriorStore, name: str) -> None:
-        self.store, self.name = store, name
+    def __init__(self, store: PriorStore, name: str, network: FlowNetwork | None = None) -> None:
+        self.store, self.name, self.network = store, name, network
         self.even = len({b - a for a, b in zip(store.frames, store.frames[1:])}) == 1
         record = store.camera(name, store.frames[0])
         assert record is not None, "a prior of this version describes its camera"
@@ -274,11 +280,20 @@ class CameraMotion:
         (prior, image), (next_prior, later) = (self._seen(frame) for frame in self.store.frames[index : index + 2])
         kept = self.kept.get(index)
         if kept is None:
-            flow, back = dense_flow(image, later), dense_flow(later, image)
+            first, second = self.store.frames[index : index + 2]
+            flow, back = self._flow(first, second), self._flow(second, first)
             kept = (flow, back), (followed(image, later, flow, back), followed(later, image, back, flow))
             if len(self.store.cameras) * (index + 1) * 2 * flow.nbytes < KEPT:
                 self.kept[index] = kept
         return _Interval((prior, next_prior), (image, later), *kept)
+
+    def _flow(self, frame: int, other: int) -> np.ndarray:
+        """Dense flow [H, W, 2] from one frame to the one before it or behind it."""
+        images = self._seen(frame)[1], self._seen(other)[1]
+        if self.network is None:
+            return dense_flow(*images)
+        kept = EntryFolder(self.store.path / "cache" / "flow" / ("on" if other > frame else "back"), synced=False)
+        return self.network.kept(kept, self.name, frame, *images)
 
     def _read(self, frame: int) -> tuple[DepthPrior, np.ndarray]:
         prior = self.store.prior(self.name, frame)

@@ -30,6 +30,9 @@ Preprocessing = Literal["auto", "depth_anything_v2", "unit"]
 Along = Literal["z", "ray"]
 """What a stored depth is measured along."""
 
+FlowRange = Literal["bytes", "unit", "signed"]
+"""What values of an image a network of optical flow takes: 0 to 255, 0 to 1, or -1 to 1."""
+
 MultiviewScale = Literal["shared", "view", "metric"]
 """What the depth of a multi-view network is known up to."""
 
@@ -65,6 +68,11 @@ class PriorSettings(Settings):
     """Find sky and what lies beyond any parallax (`dual` alone); off, as in the paper, they are like all others."""
     between: bool = True
     """Make what the cameras would have seen between their instants, for the hook `motion`."""
+    flow_onnx: str | None = None
+    """Path of an ONNX network of optical flow for that, as RAFT is exported; OpenCV's DIS where None."""
+    flow_range: FlowRange = "bytes"
+    """What values of an image it takes: `bytes`, 0 to 255 (RAFT, SEA-RAFT, OpenCV's zoo), `unit`, 0 to 1, or `signed`,
+    -1 to 1 (torchvision's RAFT)."""
     depth_range: tuple[Positive, Positive] | None = None
     """Near and far of the stereo search, world units; by default from sparse points, the data set, or the baselines."""
     mono_onnx: str | None = None

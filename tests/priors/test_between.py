@@ -205,6 +205,43 @@ class TestHalfway:
         on_a_curve, in_the_middle = (np.abs(halfway - at(t))[:, inner].mean() for t in (1.5, np.sqrt(2.5)))
         assert on_a_curve < 0.5 * in_the_middle
 
+    def test_a_network_of_flow_takes_the_place_of_dense_flow(self, tmp_path: Path) -> None:
+        """A bar that turns about its middle by more than what OpenCV's flow, or a limb, follows."""
+        bar = np.repeat(np.linspace(0, 255, 60)[None, :, None], 12, 0).repeat(3, 2).astype(np.uint8)
+        middle, turn = np.array([WIDTH / 2, HEIGHT / 2]), np.radians(60)
+
+        def matrix(instant: float) -> np.ndarray:
+            angle = turn * instant
+            turned = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+            return np.column_stack([turned, middle - turned @ (30, 6)])
+
+        def at(instant: float) -> tuple[np.ndarray, np.ndarray]:
+            size = (WIDTH, HEIGHT)
+            covered = cv2.warpAffine(np.ones((12, 60), np.uint8), matrix(instant), size, flags=cv2.INTER_NEAREST) > 0
+            image = np.where(covered[..., None], cv2.warpAffine(bar, matrix(instant), size), wall())
+            return image, covered
+
+        class TrueFlow:
+            fingerprint = "true"
+
+            def kept(self, entries, camera: str, frame: int, image: np.ndarray, other: np.ndarray) -> np.ndarray:
+                step = 1 if entries.path.name == "on" else -1
+                angle, places = turn * step, np.indices((HEIGHT, WIDTH))[::-1].transpose(1, 2, 0) - middle
+                turned = places @ np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+                return ((turned - places) * at(frame)[1][..., None]).astype(np.float32)
+
+        errors = []
+        for network in (None, TrueFlow()):
+            store = thrown(tmp_path / str(network is None), 3, changes={frame: at(frame)[0] for frame in range(3)})
+            assert build_between(store, network=network) == 2
+            assert build_between(store, network=network) == 0
+            halfway, (truth, covered) = store.underway("cam0", 0, 2)[1], at(0.5)
+            inner = cv2.erode(covered.astype(np.uint8), np.ones((5, 5))) > 0
+            errors.append(np.abs(halfway.colors.numpy().astype(int) - truth)[inner].mean())
+        assert (halfway.labels.numpy() != Label.CONFLICT)[inner].mean() > 0.9
+        assert errors[1] < 0.3 * errors[0]
+        assert build_between(store) == 2  # by other flow
+
     def test_where_nothing_moves_it_is_the_image_and_no_depth_is_proposed(self, tmp_path: Path) -> None:
         store = thrown(tmp_path, 3, changes={frame: shown() for frame in range(3)})
         build_between(store)

@@ -104,7 +104,7 @@ def test_what_is_no_monocular_network_is_refused(tmp_path: Path, made: dict, giv
 
 
 def test_files_that_are_no_network_and_images_that_fill_the_memory_are_refused(tmp_path: Path) -> None:
-    refuses("no monocular network at", MonocularModel, tmp_path / "none.onnx", "relative")
+    refuses("no network of monocular depth at", MonocularModel, tmp_path / "none.onnx", "relative")
     (tmp_path / "text.onnx").write_text("this is no network")
     refuses("cannot read .* as an ONNX network", MonocularModel, tmp_path / "text.onnx", "relative")
     free = MonocularModel(tiny_onnx.mean_network(tmp_path / "free.onnx", "h", "w"), "relative")

@@ -106,7 +106,7 @@ class MonocularModel:
         self.path, self.kind = Path(path), kind
         refuse_unknown("monocular kind", [str(kind)], KINDS)
         refuse_unknown("preprocessing", [preprocessing], PREPROCESSINGS)
-        self.session = _session(self.path, threads)
+        self.session = opened(self.path, threads, "monocular depth")
         self.input = NetworkInput.of(self.session, self.path, views)
         self.preprocessing = _recognised(self.input) if preprocessing == "auto" else preprocessing
         self.provider = self.session.get_providers()[0]
@@ -157,13 +157,18 @@ class MonocularModel:
 
     def fingerprint(self) -> str:
         """What the prediction depends on besides the image: files, provider and preprocessing."""
-        digest = hashlib.sha256()
-        for path in (self.path, *external_weights(self.path)):
-            with path.open("rb") as file:
-                while chunk := file.read(1 << 22):
-                    digest.update(chunk)
-        digest.update(f"{self.provider} {self.preprocessing}".encode())
-        return digest.hexdigest()[:32]
+        return hash_of_files(self.path, f"{self.provider} {self.preprocessing}")
+
+
+def hash_of_files(network: Path, more: str = "") -> str:
+    """Of an ONNX file, the weights beside it, and `more`."""
+    digest = hashlib.sha256()
+    for path in (network, *external_weights(network)):
+        with path.open("rb") as file:
+            while chunk := file.read(1 << 22):
+                digest.update(chunk)
+    digest.update(more.encode())
+    return digest.hexdigest()[:32]
 
 
 def external_weights(path: Path) -> list[Path]:
@@ -225,10 +230,11 @@ def _recognised(network: NetworkInput) -> str:
     return "depth_anything_v2" if all(size % PATCH == 0 for size in sizes) else "unit"
 
 
-def _session(path: Path, threads: int) -> Any:
-    onnxruntime = imported("onnxruntime", "onnxruntime", "mono", "monocular depth from an ONNX file")
+def opened(path: Path, threads: int, of: str) -> Any:
+    """The session of an ONNX file `of` something, on the GPU where onnxruntime has one."""
+    onnxruntime = imported("onnxruntime", "onnxruntime", "mono", f"{of} from an ONNX file")
     if not path.is_file():
-        raise D2Error(f"no monocular network at {path}: give the path of an ONNX file")
+        raise D2Error(f"no network of {of} at {path}: give the path of an ONNX file")
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads
     options.inter_op_num_threads = 1

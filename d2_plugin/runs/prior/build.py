@@ -34,6 +34,14 @@ def build_priors_for(
     frames as well, for the hook `motion`. `on_view` is called after each finished view, or part of a cluster's work.
     """
 
+    settings = scene.prior_settings
+    between = between and settings.between and scene.plan.uses("temporal") and shard is None
+    network = None
+    if between and settings.flow_onnx is not None:
+        from d2_plugin.priors.flow_network import FlowNetwork  # needs an extra
+
+        network = FlowNetwork(settings.flow_onnx, settings.flow_range, settings.mono_threads)
+
     def report(bar: Bar, done: int, total: int = 0, note: str = "") -> None:
         bar.update(done, note)
         on_view()
@@ -45,12 +53,12 @@ def build_priors_for(
             from d2_plugin.priors.dask_build import build_priors_on_cluster  # needs an extra
 
             build = partial(build_priors_on_cluster, **cluster)
-        given = scene.recording, scene.train_cameras, folder, scene.prior_settings
+        given = scene.recording, scene.train_cameras, folder, settings
         summary = build(*given, sparse_points=points, progress=partial(report, bar))
-    if between and scene.prior_settings.between and scene.plan.uses("temporal") and shard is None:
+    if between:
         store = PriorStore.described(PriorStore.located(folder, scene.train_cameras))
         with progress_bar("between", len(store.cameras) * (len(store.frames) - 1)) as bar:
-            build_between(store, partial(report, bar))
+            build_between(store, partial(report, bar), network)
     return summary
 
 
