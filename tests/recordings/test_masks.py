@@ -14,7 +14,7 @@ from d2_plugin.gaussians.photometric import photometric_loss, weighted_photometr
 from d2_plugin.priors.construct import _relabelled
 from d2_plugin.priors.fuse import fuse
 from d2_plugin.protocol import Label
-from d2_plugin.recordings import open_recording
+from d2_plugin.recordings import Recording, open_recording
 from d2_plugin.recordings.cameras.camera import CalibratedCamera
 from d2_plugin.recordings.cameras.check import check_background_weight
 from d2_plugin.recordings.cameras.lens import Lens
@@ -183,6 +183,24 @@ def test_the_score_inside_the_mask(tmp_path: Path) -> None:
     assert rows["cam00", 0]["psnr_mask"] == pytest.approx(-10 * torch.log10(error).item(), abs=1e-3)
     assert rows["cam00", 1]["psnr_mask"] is None
     assert rows["cam01", 0]["psnr_mask"] is None
+
+
+def test_what_was_not_recorded_is_not_scored(tmp_path: Path) -> None:
+    whole = open_recording(recorded_folder(tmp_path / "recording"))
+
+    def scores(of: Recording, off: float) -> dict[str, float]:
+        def render(camera: str, frame: int) -> tuple[torch.Tensor, None]:
+            drawn = torch.from_numpy(whole.image(camera, frame)).float() / 255
+            drawn[-5:] += off
+            return (0.9 * drawn).clamp(0, 1), None
+
+        found = evaluate(render, of, CAMERAS[:1], of.frames)["test"]
+        return {name: value for name, value in found.items() if value is not None and "depth" not in name}
+
+    cut = open_recording(recorded_folder(tmp_path / "cut", valid=True))
+    assert scores(cut, 0.0) == scores(cut, 0.5)
+    assert scores(whole, 0.0) != scores(whole, 0.5)
+    assert scores(cut, 0.0)["psnr"] == pytest.approx(scores(whole, 0.0)["psnr"], abs=1)
 
 
 def test_a_prior_knows_nothing_of_what_was_not_recorded() -> None:
