@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -97,6 +98,9 @@ def test_units_that_are_no_metres_are_noted_with_the_scale_that_mends_them(per_m
     assert f"looks like {unit} instead of metres" in note
     for camera, known in zip(scaled(calibration.cameras, 1 / per_metre), rig(), strict=True):
         assert_same(camera, known, POINTS)
+        assert camera.near_far is None
+        (bounded,) = scaled([replace(camera, near_far=(500.0, 9000.0))], 0.001)
+        assert bounded.near_far == pytest.approx((0.5, 9.0))  # else no camera would see what another one sees
 
 
 def test_names_that_only_some_files_have(tmp_path: Path) -> None:

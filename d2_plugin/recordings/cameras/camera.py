@@ -83,7 +83,11 @@ def scaled(cameras: Sequence[CalibratedCamera], scale: float) -> tuple[Calibrate
     if not 0 < scale < LARGEST_NUMBER:
         raise D2Error(f"scale is {scale:g}, expected a number above 0, such as .001 for millimetres")
     return tuple(
-        replace(one, T_camera_world=rigid(one.T_camera_world[:3, :3], scale * one.T_camera_world[:3, 3]))
+        replace(
+            one,
+            T_camera_world=rigid(one.T_camera_world[:3, :3], scale * one.T_camera_world[:3, 3]),
+            near_far=one.near_far and (scale * one.near_far[0], scale * one.near_far[1]),
+        )
         for one in cameras
     )
 
