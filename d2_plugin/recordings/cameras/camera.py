@@ -174,7 +174,7 @@ def resized(K: np.ndarray, calibrated: tuple[int, int], images: tuple[int, int],
     if abs(scale[1] - scale[0]) > ASPECT_TOLERANCE * scale[0]:
         raise D2Error(
             f"images of camera {name} are {images[0]}x{images[1]} but {where} says {calibrated[0]}x"
-            f"{calibrated[1]}, another aspect: use images that are scaled, not cropped"
+            f"{calibrated[1]}, another aspect: use images that are scaled, not cropped or turned (EXIF is not followed)"
         )
     return np.diag([*scale, 1.0]) @ K
 
