@@ -271,7 +271,7 @@ NO_DIFFERENCE = 100.0
 
 METRICS = {
     "psnr": Metric(
-        f"20 log10(1 / sqrt(MSE)) per image in dB, at most {NO_DIFFERENCE:g}, then the mean over images",
+        f"20 log10(1 / sqrt(MSE)) of an image's recorded pixels in dB, at most {NO_DIFFERENCE:g}; mean over images",
         lambda c: min(psnr(c.image, c.truth, c.recorded), NO_DIFFERENCE),
     ),
     "psnr_cc": Metric(
