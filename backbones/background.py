@@ -58,7 +58,12 @@ class Background:
         self._bases: dict[tuple[Any, ...], Tensor] = {}
 
     @torch.no_grad()
-    def start_from(self, views: Sequence[View], images: Callable[[int], Tensor]) -> None:
+    def start_from(
+        self,
+        views: Sequence[View],
+        images: Callable[[int], Tensor],
+        recorded: Callable[[int], Tensor | None] = lambda index: None,
+    ) -> None:
         """Begin with what the images show in each direction, as if all of it were at infinity.
 
         Least squares over the nodes of at most `STARTING_IMAGES` views, spread evenly. A ridge that grows with the
@@ -66,11 +71,12 @@ class Background:
 
         Args:
             images: the image [H, W, 3] in 0..1 of each, by its index in `views`.
+            recorded: which of its pixels [H, W] were recorded; None for all: lenses leave black where nothing was.
         """
         if not views:
             return
         chosen = sorted({round(index) for index in torch.linspace(0, len(views) - 1, STARTING_IMAGES).tolist()})
-        seen = [self._seen(views[index], images(index)) for index in chosen]
+        seen = [self._seen(views[index], images(index), recorded(index)) for index in chosen]
         values = torch.cat([harmonics for harmonics, _ in seen]).double()
         colors = torch.cat([color for _, color in seen]).double() - 0.5
         degrees = torch.tensor([degree for degree in range(DEGREE + 1) for _ in range(2 * degree + 1)])
@@ -120,14 +126,18 @@ class Background:
         for group, rate in zip(self.optimizer.param_groups, (RATE, RATE / 5)):
             group["lr"] = share * rate
 
-    def _seen(self, view: View, image: Tensor) -> tuple[Tensor, Tensor]:
+    def _seen(self, view: View, image: Tensor, recorded: Tensor | None) -> tuple[Tensor, Tensor]:
         """Harmonics [nodes, (DEGREE + 1)^2] and colours [nodes, 3] at those nodes of a view inside of its image."""
         rows, columns, stride = _nodes(view)
         row = stride * torch.arange(rows, device=image.device)
         column = stride * torch.arange(columns, device=image.device)
         row, column = row[row < view.height], column[column < view.width]
         harmonics = self._basis(view).view(rows, columns, -1)[: len(row), : len(column)]
-        return harmonics.flatten(0, 1), image[row][:, column].flatten(0, 1).to(self.constant)
+        harmonics, colors = harmonics.flatten(0, 1), image[row][:, column].flatten(0, 1).to(self.constant)
+        if recorded is None:
+            return harmonics, colors
+        kept = recorded[row][:, column].flatten()
+        return harmonics[kept], colors[kept]
 
     def _basis(self, view: View) -> Tensor:
         """Harmonics of the nodes' directions [nodes, (DEGREE + 1)^2]; kept, since cameras mostly stand still."""

@@ -28,7 +28,12 @@ JITTER_FROM = 1000
 class Model(Protocol):
     """What the loop needs of a backbone."""
 
-    def start_from(self, views: Sequence[View], images: Callable[[int], Tensor]) -> None: ...
+    def start_from(
+        self,
+        views: Sequence[View],
+        images: Callable[[int], Tensor],
+        recorded: Callable[[int], Tensor | None],
+    ) -> None: ...
     def render(
         self, view: View, background: Tensor | None = None, generator: torch.Generator | None = None
     ) -> Render: ...
@@ -61,7 +66,8 @@ class Frames(Protocol):
     """The training images: views, and the image [H, W, 3] in 0..1 of each.
 
     Where there is also `image_bytes(index)`, the same as it is kept (uint8, 0..255), the loss is computed from that.
-    It may have `weights(index) -> [H, W] | None` as well: how much each pixel counts, 0..1.
+    It may have `weights(index) -> [H, W] | None` as well: how much each pixel counts, 0..1; and `recorded(index)`, bool
+    [H, W] or None: which of them the camera recorded.
     """
 
     views: Sequence[View]
@@ -93,7 +99,7 @@ class Trainer:
     ) -> None:
         self.model, self.frames, self.settings = model, frames, settings
         self.step = 0
-        model.start_from(frames.views, frames.image)
+        model.start_from(frames.views, frames.image, getattr(frames, "recorded", lambda index: None))
         self.loss: Tensor | None = None
         """The last step's loss with all its terms, for whoever watches that it stays finite."""
         self._generator = torch.Generator().manual_seed(settings.seed)

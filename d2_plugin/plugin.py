@@ -97,7 +97,7 @@ class D2Hooks:
         self._finite = FiniteCheck(backbone, config.finite_every)
         self._order, self._used = StepOrder(), threading.Lock()
         self._count = len(backbone)
-        self._warned = self._idle_insert = self._passed_over = False
+        self._warned = self._idle_insert = self._passed_over = self._detached = False
         self._inserting = 0  # the step while the backbone inserts for us, else 0
         self._fresh = torch.zeros(0, dtype=torch.int32, device="cpu")  # 1: the trainer added it since our last step
         self.inserted_at = torch.zeros(self._count, dtype=torch.int32, device="cpu")
@@ -213,6 +213,12 @@ class D2Hooks:
                 self.trace.append(Trace(step, name, "loss", 0))
                 self.log.record_loss(name, term)
                 total = total + term if isinstance(total, Tensor) else term
+        if isinstance(total, Tensor) and not (total.requires_grad or self._detached):
+            self._detached = True
+            _log.warning(
+                "d2.loss has no gradient and supervises nothing: call it outside of torch.no_grad, and let slice_at() "
+                "return tensors that are computed from trained parameters"
+            )
         self._finite.remember(total, shown)
         return total
 

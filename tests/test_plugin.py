@@ -154,6 +154,14 @@ def test_evaluations_visit_every_view_before_any_twice() -> None:
     assert ViewSampler().sample(3, generator) == []
 
 
+def test_evaluations_look_from_where_a_trainer_that_refines_poses_has_its_cameras_now() -> None:
+    sampler, view = ViewSampler(), make_views()[0]
+    refined = replace(view, T_camera_world=view.T_camera_world @ torch.diag(torch.tensor([-1.0, 1, -1, 1])))
+    assert sampler.add(view)
+    assert not sampler.add(refined)
+    assert sampler.sample(1, torch.Generator()) == [refined]
+
+
 def test_every_view_is_looked_at_before_insertion_ends() -> None:
     looked: list[list] = []
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
+from d2_plugin.commands.arguments.recording import show_notes
 from d2_plugin.protocol import EXPORT_FILE
 from d2_plugin.reading import read_json
 from d2_plugin.recordings import Recording, open_recording, select_cameras
@@ -46,6 +47,7 @@ def run(settings: RecordingExport) -> str:
     """Write the recording; returns what was written and where."""
     unused_folder(settings.output)  # or say so at once
     recording = open_recording(settings.recording, frames=settings.frames, downscale=settings.downscale)
+    show_notes(recording.notes)
     held_out = settings.test_cameras
     train = settings.train_cameras or tuple(name for name in recording.cameras if name not in held_out)
     recording = select_cameras(recording, [*train, *(name for name in held_out if name not in train)])

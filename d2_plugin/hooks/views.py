@@ -47,8 +47,8 @@ class ViewSampler:
             check_view(view)
             poses = [known.T_camera_world for known in self.instants(view.camera)[:1]]
             self._moving |= not all(torch.equal(pose, view.T_camera_world) for pose in poses)
-            self._views[view.camera, view.frame] = view
             self._looks[view.camera, view.frame] = 0
+        self._views[view.camera, view.frame] = view  # where a trainer refines poses, the present one
         return new
 
     def due(self, left: float) -> int:

@@ -119,16 +119,19 @@ def evaluate(
     networks = {"lpips": lpips, "lpips_vgg": lpips_vgg}
     still: np.ndarray | None = None  # what the camera sees where nothing moves
     before: tuple[str, Tensor, Tensor] | None = None  # camera, render and truth of the view before
+    recorded: np.ndarray | None = None  # what counts of the camera's images
     for done, (camera, frame) in enumerate(views, start=1):
         if before is None or before[0] != camera:
             still, before = still_image(recording, camera, instants), None
+            recorded = what_counts(recording, camera)
         truth = torch.from_numpy(recording.image(camera, frame).astype(np.float32) / 255)
         color, depth = _checked(render(camera, frame), truth.shape, camera, frame)
+        color = as_recorded(color, truth, recorded)
         true_depth = recording.depth(camera, frame)
         compared = metrics.Compared(
             *(color, truth, depth, None if true_depth is None else torch.from_numpy(true_depth)),
             what_moves(truth.numpy(), still),
-            *(None if before is None else before[1:], networks, _inside(recording, camera, frame)),
+            *(None if before is None else before[1:], networks, _inside(recording, camera, frame), recorded),
         )
         scores = {name: metric.score(compared) for name, metric in metrics.METRICS.items()}
         rows.append({"camera": camera, "frame": frame, **scores})
@@ -165,11 +168,22 @@ def what_moves(image: np.ndarray, still: np.ndarray | None) -> np.ndarray | None
     return moving if moving is not None and moving.mean() > MOVING_SHARE else None
 
 
+def what_counts(recording: Recording, camera: str) -> np.ndarray | None:
+    """The pixels [H, W] of a camera's images that were recorded, by which it is scored; None where all are."""
+    recorded, rim = recording.recorded(camera), metrics.UNIFORM_WINDOW // 2
+    return recorded if recorded is not None and recorded[rim:-rim, rim:-rim].any() else None
+
+
+def as_recorded(image: Tensor, truth: Tensor, recorded: np.ndarray | None) -> Tensor:
+    """An image [H, W, 3] with the black of the truth where undistorting left nothing: that nobody can have drawn."""
+    return image if recorded is None else torch.where(torch.from_numpy(recorded)[..., None], image, truth)
+
+
 def _inside(recording: Recording, camera: str, frame: int) -> np.ndarray | None:
-    """The pixels [H, W] of the foreground mask that were recorded; None where neither is known."""
+    """The pixels [H, W] of the foreground mask that were recorded; None where there is none."""
     mask, recorded = recording.mask(camera, frame), recording.recorded(camera)
     if mask is None:
-        return recorded
+        return None
     inside = mask > 0.5 if recorded is None else (mask > 0.5) & recorded
     return inside if inside.any() else None
 

@@ -235,7 +235,17 @@ class Compared:
     """Render and truth of the frame before, of the same camera."""
     networks: Mapping[str, Callable[[Tensor, Tensor], float] | None] = field(default_factory=dict)
     inside: np.ndarray | None = None
-    """[H, W] bool, recorded pixels inside the recording's foreground mask; None where it has neither."""
+    """[H, W] bool, recorded pixels inside the recording's foreground mask; None where it has none."""
+    recorded: np.ndarray | None = None
+    """[H, W] bool, pixels that were recorded; None where all were. At the others image and truth are the same."""
+
+    @property
+    def pixels(self) -> tuple[Tensor, Tensor]:
+        """Image and truth [1, K, 3] of what was recorded, whole where all was."""
+        if self.recorded is None:
+            return self.image, self.truth
+        where = torch.from_numpy(self.recorded)
+        return self.image[where][None], self.truth[where][None]
 
     @property
     def depths(self) -> tuple[Tensor, Tensor] | None:
@@ -261,12 +271,12 @@ NO_DIFFERENCE = 100.0
 
 METRICS = {
     "psnr": Metric(
-        f"20 log10(1 / sqrt(MSE)) per image in dB, at most {NO_DIFFERENCE:g}, then the mean over images",
-        lambda c: min(psnr(c.image, c.truth), NO_DIFFERENCE),
+        f"20 log10(1 / sqrt(MSE)) of an image's recorded pixels in dB, at most {NO_DIFFERENCE:g}; mean over images",
+        lambda c: min(psnr(c.image, c.truth, c.recorded), NO_DIFFERENCE),
     ),
     "psnr_cc": Metric(
         "PSNR with a truth + b = image undone in each channel where that helps (gsplat color_correct_affine)",
-        lambda c: min(psnr_color_corrected(c.image, c.truth), NO_DIFFERENCE),
+        lambda c: min(psnr_color_corrected(*c.pixels), NO_DIFFERENCE),
     ),
     "psnr_moving": Metric(
         "PSNR of the pixels that differ by more than 12/255 from the median of their camera's frames (this project)",
@@ -278,11 +288,11 @@ METRICS = {
     ),
     "ssim1": Metric(
         "uniform 7x7 window, sample covariance, 3 px border dropped, data range 1 (scikit-image)",
-        lambda c: ssim_uniform(c.image, c.truth),
+        lambda c: ssim_uniform(c.image, c.truth, within=c.recorded),
     ),
     "ssim2": Metric(
         "uniform 7x7 window, sample covariance, 3 px border dropped, data range 2 (scikit-image)",
-        lambda c: ssim_uniform(c.image, c.truth, data_range=2.0),  # scikit-image's old default for floats
+        lambda c: ssim_uniform(c.image, c.truth, 2.0, c.recorded),  # scikit-image's old default for floats
     ),
     "ssim_3dgs": Metric(
         "Gaussian 11x11 window with sigma 1.5, zero padding, biased covariance (3DGS)",

@@ -142,6 +142,11 @@ class TrainingFrames:
             self._kept.move_to_end(index)
         return torch.from_numpy(self._kept[index]).to(self.device)
 
+    def recorded(self, index: int) -> Tensor | None:
+        """Which pixels [H, W] of `views[index]` were recorded, bool; None where all were."""
+        recorded = self._recorded[self.views[index].camera]
+        return None if recorded is None else torch.from_numpy(recorded).to(self.device)
+
     def weights(self, index: int) -> Tensor | None:
         """How much each pixel [H, W] of `views[index]` counts: `background_weight` outside the foreground mask, 0 where
         nothing was recorded; None where all pixels count alike."""
@@ -238,6 +243,8 @@ def _random_points(
 ) -> TimedPoints:
     calibration, frame = recording.cameras[camera], recording.frames[int(rng.integers(len(recording.frames)))]
     columns, rows = rng.integers(calibration.width, size=count), rng.integers(calibration.height, size=count)
+    if (recorded := recording.recorded(camera)) is not None and recorded.any():
+        rows, columns = rng.choice(np.argwhere(recorded), count).T  # elsewhere an undistorted image is black
     depth = 1 / rng.uniform(1 / extent.far, 1 / extent.near, count)
     times = rng.uniform(0, max(recording.seconds(recording.frames[-1]), 1e-9), count)
     return replace(_back_projected(recording, camera, frame, rows, columns, depth), times=times)

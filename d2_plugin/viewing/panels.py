@@ -12,6 +12,7 @@ from torch import Tensor
 from d2_plugin.protocol import View
 from d2_plugin.recordings.images import color_bytes, opencv
 from d2_plugin.runs.drawing import Panel, Scale, colorize, depth_panel, error_panel
+from d2_plugin.runs.evaluation import what_counts
 from d2_plugin.viewing.rendering import RenderedView, render_view
 from d2_plugin.viewing.viewed import ViewedRun
 
@@ -54,7 +55,9 @@ def true_depth(shot: Shot) -> Panel:
 def error(shot: Shot) -> Panel:
     """Absolute error of the render against the recorded image."""
     difference = np.abs(shot.rendered.color.numpy() - shot.truth / np.float32(255))
-    noise = float(np.mean(difference**2))
+    counts = what_counts(shot.viewed.recording, shot.view.camera)
+    scored = ... if counts is None else fitted(counts.astype(np.uint8), shot.view.width, shot.view.height, True) > 0
+    noise = float(np.mean(difference[scored] ** 2))
     return error_panel(difference, f"  {-10 * np.log10(noise):.1f} dB" if noise > 0 else "")
 
 

@@ -145,6 +145,13 @@ class TestStart:
             shown = sky_of(sky, turned(views[0], angle))
             torch.testing.assert_close(shown, self.flat(views[0], color), atol=1e-4, rtol=0)
 
+    def test_what_was_not_recorded_is_no_colour(self) -> None:
+        view, color, recorded = make_views()[0], (0.2, 0.5, 0.9), torch.ones(24, 32, dtype=torch.bool)
+        recorded[:, :9] = False
+        image, sky = self.flat(view, color) * recorded[..., None], Background(torch.device("cpu"))
+        sky.start_from([view], lambda index: image, lambda index: recorded)
+        torch.testing.assert_close(sky_of(sky, view), self.flat(view, color), atol=1e-4, rtol=0)
+
     @pytest.mark.parametrize("seed", range(3))
     def test_no_direction_is_brighter_or_darker_than_a_image_can_be(self, seed: int) -> None:
         views = make_views()[:2]

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -84,7 +85,7 @@ def test_recordings_of_another_size_scale_the_intrinsics(tmp_path: Path) -> None
     seen = (POINTS @ found.T_camera_world[:3, :3].T + found.T_camera_world[:3, 3]) @ found.pinhole().K.T
     half_size = found.lens.recorded_pixels(seen[:, :2] / seen[:, 2:])
     np.testing.assert_allclose(half_size, (cameras[1].project(POINTS) + 0.5) / 2, atol=0.01)
-    refuses("images of camera cam_1 are 720x1280 .* another aspect", cameras_of, path, {"cam_1": (720, 1280)})
+    refuses("cam_1 are 720x1280 .* another aspect: .* turned .EXIF is not", cameras_of, path, {"cam_1": (720, 1280)})
 
 
 @pytest.mark.parametrize(
@@ -97,6 +98,9 @@ def test_units_that_are_no_metres_are_noted_with_the_scale_that_mends_them(per_m
     assert f"looks like {unit} instead of metres" in note
     for camera, known in zip(scaled(calibration.cameras, 1 / per_metre), rig(), strict=True):
         assert_same(camera, known, POINTS)
+        assert camera.near_far is None
+        (bounded,) = scaled([replace(camera, near_far=(500.0, 9000.0))], 0.001)
+        assert bounded.near_far == pytest.approx((0.5, 9.0))  # else no camera would see what another one sees
 
 
 def test_names_that_only_some_files_have(tmp_path: Path) -> None:

@@ -13,8 +13,9 @@ from small_layouts import small_recording
 from d2_plugin.gaussians.photometric import photometric_loss, weighted_photometric_loss
 from d2_plugin.priors.construct import _relabelled
 from d2_plugin.priors.fuse import fuse
+from d2_plugin.priors.geometry import projected
 from d2_plugin.protocol import Label
-from d2_plugin.recordings import open_recording
+from d2_plugin.recordings import Recording, open_recording
 from d2_plugin.recordings.cameras.camera import CalibratedCamera
 from d2_plugin.recordings.cameras.check import check_background_weight
 from d2_plugin.recordings.cameras.lens import Lens
@@ -22,7 +23,7 @@ from d2_plugin.recordings.cameras.undistort import Undistortion
 from d2_plugin.recordings.export.folder import save_recording
 from d2_plugin.recordings.images import MASK_FOLDERS
 from d2_plugin.runs.evaluation import evaluate
-from d2_plugin.runs.start import TrainingFrames
+from d2_plugin.runs.start import Extent, TimedPoints, TrainingFrames, initial_points
 
 cv2 = pytest.importorskip("cv2", reason="opencv is in the `image` extra")
 
@@ -183,6 +184,33 @@ def test_the_score_inside_the_mask(tmp_path: Path) -> None:
     assert rows["cam00", 0]["psnr_mask"] == pytest.approx(-10 * torch.log10(error).item(), abs=1e-3)
     assert rows["cam00", 1]["psnr_mask"] is None
     assert rows["cam01", 0]["psnr_mask"] is None
+
+
+def test_what_was_not_recorded_is_not_scored(tmp_path: Path) -> None:
+    whole = open_recording(recorded_folder(tmp_path / "recording"))
+
+    def scores(of: Recording, off: float) -> dict[str, float]:
+        def render(camera: str, frame: int) -> tuple[torch.Tensor, None]:
+            drawn = torch.from_numpy(whole.image(camera, frame)).float() / 255
+            drawn[-5:] += off
+            return (0.9 * drawn).clamp(0, 1), None
+
+        found = evaluate(render, of, CAMERAS[:1], of.frames)["test"]
+        return {name: value for name, value in found.items() if value is not None and "depth" not in name}
+
+    cut = open_recording(recorded_folder(tmp_path / "cut", valid=True))
+    assert scores(cut, 0.0) == scores(cut, 0.5)
+    assert scores(whole, 0.0) != scores(whole, 0.5)
+    assert scores(cut, 0.0)["psnr"] == pytest.approx(scores(whole, 0.0)["psnr"], abs=1)
+
+
+def test_a_run_begins_with_nothing_that_was_not_recorded(tmp_path: Path) -> None:
+    recording = open_recording(recorded_folder(tmp_path / "recording", valid=True))
+    start = initial_points(recording, CAMERAS[:1], TimedPoints(*np.zeros((3, 0, 3))[:2], np.zeros(0)), Extent(1, 9, 3))
+    rows = projected(recording.cameras["cam00"], start.positions)[0][:, 1]
+    assert len(rows) > 0
+    assert rows.max() < H - 5
+    assert not TrainingFrames(recording, CAMERAS).recorded(0)[-5:].any()
 
 
 def test_a_prior_knows_nothing_of_what_was_not_recorded() -> None:

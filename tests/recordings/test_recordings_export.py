@@ -163,6 +163,11 @@ def test_the_command_writes_points_and_says_where(tmp_path: Path, answered, refu
     content = json.loads((tmp_path / "scene" / "export.json").read_text())
     assert (list(content["cameras"]), content["test_cameras"]) == (["00", "02", "01"], ["01"])
     assert int((tmp_path / "scene" / "points3d.ply").read_bytes().split(b"element vertex ")[1].split()[0]) >= 50
+    sorted((source / "images" / "03").iterdir())[-1].unlink()
+    fewer = f"{source} --format transforms --output {tmp_path / 'fewer'} --points 0"
+    assert "note  1 frame left out: not every camera has them\n4 cameras, 2 frames" in answered(
+        "export-recording", *fewer.split()
+    )
 
 
 class TestColmapFrames:

@@ -59,6 +59,21 @@ def test_distortion_beside_a_image_is_undone(tmp_path: Path) -> None:
     refused(write(tmp_path, two_by_two(fl_x=30.0, k4=0.1)), "6 distortion coefficients")
 
 
+def test_instant_ngp_says_fisheye_by_a_flag(tmp_path: Path) -> None:
+    pytest.importorskip("cv2")
+    lens = {"fl_x": 30.0, "k1": 0.05, "k2": 0.01, "k3": 0.01, "k4": 0.01}
+    images = [
+        open_recording(write(tmp_path / name, two_by_two(**lens), **{name: value})).image("cam00", 1)
+        for name, value in (("is_fisheye", True), ("camera_model", "OPENCV_FISHEYE"))
+    ]
+    np.testing.assert_array_equal(*images)
+
+
+@pytest.mark.parametrize("model", ["EQUIRECTANGULAR", "ORTHOPHOTO", "VR180_L", "FISHEYE624"])
+def test_a_camera_that_is_no_pinhole_behind_a_lens_is_refused(model: str, tmp_path: Path) -> None:
+    refused(write(tmp_path, two_by_two(), camera_model=model), f"camera_model '{model}', which is none of PINHOLE")
+
+
 def test_frames_are_counted_by_time_where_names_do_not_run_with_it(tmp_path: Path) -> None:
     # Two splits, each numbered from 0: the same numbers mean other times.
     write(tmp_path, [entry(f"train/a_{i}", time=t) for i, t in enumerate((0.0, 0.5))], "transforms_train.json")

@@ -171,6 +171,16 @@ def test_a_remove_that_keeps_what_it_should_delete_is_refused() -> None:
     refuses("mask of 20 Gaussians and took 40: True in it", hooks(adapter=adapter)._remove, 1, [("own", edit)])
 
 
+def test_a_loss_without_a_gradient_is_named_once(caplog: pytest.LogCaptureFixture) -> None:
+    d2 = hooks()
+    assert d2.loss(1, FIRST).requires_grad
+    assert "has no gradient" not in caplog.text
+    with torch.no_grad():
+        for step in (2, 3):
+            d2.loss(step, FIRST)
+    assert caplog.text.count("d2.loss has no gradient and supervises nothing: call it outside of torch.no_grad") == 1
+
+
 def test_an_insert_that_adds_nothing_is_named_once(caplog: pytest.LogCaptureFixture) -> None:
     d2 = inserting(0)
     for step in (1, 2):

@@ -83,7 +83,11 @@ def scaled(cameras: Sequence[CalibratedCamera], scale: float) -> tuple[Calibrate
     if not 0 < scale < LARGEST_NUMBER:
         raise D2Error(f"scale is {scale:g}, expected a number above 0, such as .001 for millimetres")
     return tuple(
-        replace(one, T_camera_world=rigid(one.T_camera_world[:3, :3], scale * one.T_camera_world[:3, 3]))
+        replace(
+            one,
+            T_camera_world=rigid(one.T_camera_world[:3, :3], scale * one.T_camera_world[:3, 3]),
+            near_far=one.near_far and (scale * one.near_far[0], scale * one.near_far[1]),
+        )
         for one in cameras
     )
 
@@ -170,7 +174,7 @@ def resized(K: np.ndarray, calibrated: tuple[int, int], images: tuple[int, int],
     if abs(scale[1] - scale[0]) > ASPECT_TOLERANCE * scale[0]:
         raise D2Error(
             f"images of camera {name} are {images[0]}x{images[1]} but {where} says {calibrated[0]}x"
-            f"{calibrated[1]}, another aspect: use images that are scaled, not cropped"
+            f"{calibrated[1]}, another aspect: use images that are scaled, not cropped or turned (EXIF is not followed)"
         )
     return np.diag([*scale, 1.0]) @ K
 

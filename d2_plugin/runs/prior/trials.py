@@ -33,7 +33,7 @@ from d2_plugin.plugin import D2Hooks
 from d2_plugin.progress import progress_bar
 from d2_plugin.protocol import DepthPrior, RasterSettings
 from d2_plugin.recordings import open_recording
-from d2_plugin.runs.evaluation import still_image, what_moves
+from d2_plugin.runs.evaluation import as_recorded, still_image, what_counts, what_moves
 from d2_plugin.runs.metrics import NO_DIFFERENCE, psnr, ssim_uniform
 from d2_plugin.runs.scene import Scene
 from d2_plugin.runs.settings import HOOK_NAMES, RunSettings, hook_config
@@ -248,13 +248,13 @@ class _Trial:
     def likeness(self, model: Any, camera: str) -> Likeness:
         """How well a model predicts a camera, mean over the instants."""
         recording = self.scene.recording
-        still = still_image(recording, camera, recording.frames)
+        still, recorded = still_image(recording, camera, recording.frames), what_counts(recording, camera)
         whole, moving = [], []
         for frame in recording.frames:
             truth = torch.from_numpy(recording.image(camera, frame)).float() / 255
             view = make_view(recording, camera, frame, self.settings.device)
-            predicted = model.render(view).color.cpu().clamp(0, 1)
-            whole.append(Likeness.of(predicted, truth))
+            predicted = as_recorded(model.render(view).color.cpu().clamp(0, 1), truth, recorded)
+            whole.append(Likeness.of(predicted, truth, recorded))
             moves = what_moves(truth.numpy(), still)
             if moves is not None and not math.isnan((seen := Likeness.of(predicted, truth, moves)).ssim):
                 moving.append(seen)

@@ -12,6 +12,7 @@ import torch
 from d2_plugin.errors import D2Error
 from d2_plugin.gaussians.photometric import photometric_loss
 from d2_plugin.progress import progress_bar
+from d2_plugin.runs.evaluation import what_counts
 from d2_plugin.runs.metrics import psnr
 from d2_plugin.runs.start import TrainingFrames, make_view
 from d2_plugin.viewing.rendering import render_view
@@ -66,7 +67,8 @@ def _scores(viewed: ViewedRun, cameras: tuple[str, ...]) -> dict[str, float]:
 
     def score(camera: str, frame: int) -> float:
         color = render_view(viewed.backbone, make_view(recording, camera, frame, viewed.device)).color
-        return psnr(color, torch.from_numpy(recording.image(camera, frame).astype(np.float32) / 255))
+        truth = torch.from_numpy(recording.image(camera, frame).astype(np.float32) / 255)
+        return psnr(color, truth, what_counts(recording, camera))
 
     each = {camera: fmean(score(camera, frame) for frame in recording.frames) for camera in cameras}
     return {"": fmean(each.values())} | each

@@ -16,6 +16,7 @@ import torch
 from d2_plugin.errors import D2Error
 from d2_plugin.progress import show
 from d2_plugin.recordings import open_recording
+from d2_plugin.runs.evaluation import what_counts
 from d2_plugin.runs.metrics import psnr
 from d2_plugin.runs.run import Run
 from d2_plugin.runs.saved import OnStep
@@ -141,6 +142,7 @@ def _scores(viewed: ViewedRun) -> Iterator[str | None]:
                 break
             yield None
         shot = Shot(viewed, viewed.view(recording.cameras[name], recording.seconds(frame, name)))
-        scores.append(psnr(shot.rendered.color, torch.from_numpy(shot.truth).float() / 255))
+        counts = what_counts(recording, name)
+        scores.append(psnr(shot.rendered.color, torch.from_numpy(shot.truth).float() / 255, counts))
         share.spent += time.monotonic() - now
         yield f"{sum(scores) / len(scores):.2f} dB PSNR, {kind}, last {counted(len(scores), 'view')}"

@@ -19,12 +19,17 @@ from d2_plugin.recordings.cameras.camera import OPENGL_TO_OPENCV, CalibratedCame
 from d2_plugin.recordings.cameras.formats.document import CORRECT, NUMBER, Document, Table, has, numbers, object_of
 from d2_plugin.recordings.cameras.lens import checked_lens
 from d2_plugin.recordings.files import arrange
+from d2_plugin.values import shown
 
 SAME_POSE = 1e-5  # largest difference of the matrices of one camera; these files are converted, not estimated per image
 TIME_DIGITS = 12  # decimals of a time that count: splits are written by programs that divide in another order
 
 NAMES = ("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y", "k1", "k2", "k3", "k4", "p1", "p2")
 """Of numbers that describe a camera."""
+
+BENT = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "FISHEYE")
+STRAIGHT = ("PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+"""What `camera_model` may say; Instant-NGP's own converter says `is_fisheye` instead."""
 
 
 class ListedImage(NamedTuple):
@@ -87,7 +92,13 @@ def camera_of(image: ListedImage, name: str, size: tuple[int, int] | None, where
     fx, fy = _focal_lengths(given, (width, height), place)
     K = pinhole(fx, fy, given.get("cx", width / 2), given.get("cy", height / 2))
     k1, k2, k3, k4, p1, p2 = (given.get(key, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
-    fisheye = "FISHEYE" in str(image.table.get("camera_model", "")).upper()
+    said = str(image.table.get("camera_model", "OPENCV_FISHEYE" if image.table.get("is_fisheye") else "OPENCV"))
+    if said.upper() not in (*BENT, *STRAIGHT):
+        raise D2Error(
+            f"{place} has camera_model {shown(said)}, which is none of {', '.join((*STRAIGHT, *BENT))}: give pinhole "
+            "images made of it, or leave camera_model out if they are pinhole images already"
+        )
+    fisheye = said.upper() in BENT
     if k4 and not fisheye:
         raise D2Error(
             f"{place} has 6 distortion coefficients, of which OpenCV's lens has not the last, k4 of r^8: undistort the "
