@@ -201,8 +201,9 @@ class _Sources:
     def say_replaced(self, old: Mapping[str, Any], folder: Path) -> None:
         """Warn, once, that priors are replaced, and by what they differ."""
         before = old.get("settings", {})
-        other = [name for name, value in asdict(self.wanted).items() if hash_of(value) != hash_of(before.get(name))]
-        why = " and ".join(other) or "images or maps"
+        given = asdict(self.wanted)
+        other = [name for name in given if name in before and hash_of(given[name]) != hash_of(before[name])]
+        why = " and ".join(other) or "images or maps, or by another version,"
         if why not in self.replaced:
             self.replaced.add(why)
             log.warning(

@@ -189,7 +189,7 @@ def test_a_changed_image_rebuilds_its_timestamp_and_no_other(plain: Recording, b
 
     summary = build_priors(showing(plain, {"image": image}), NAMES, begun, SETTINGS)
     assert (summary.built, summary.kept) == (3, 3)
-    assert caplog.text.count("built with other images or maps are replaced") == 1
+    assert caplog.text.count("built with other images or maps, or by another version, are replaced") == 1
 
 
 def test_a_damaged_prior_is_rebuilt_and_named(plain: Recording, begun: Path, caplog: pytest.LogCaptureFixture) -> None:
