@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import get_args
 
 import numpy as np
 
-from d2_plugin.errors import D2Error, refuse_unknown
 from d2_plugin.priors.settings import Variant
 from d2_plugin.protocol import Label
 from d2_plugin.recordings.images import opencv
 from d2_plugin.store.maps import FusedPrior
-
-VARIANTS: tuple[Variant, ...] = get_args(Variant)
 
 EPSILON = 1e-9
 """The paper's eps, world units."""
@@ -73,19 +69,13 @@ def fuse(
         mono: D-bar^m float [H, W], 0 where it has none.
         geometric: D^g float [H, W], 0 where it has none.
         tau_c: largest relative discrepancy of a verified pixel, one number or a map [H, W].
-        variant: one of `VARIANTS`; `dual_unaligned` fuses like `dual` and expects the unaligned map as `mono`.
+        variant: `dual_unaligned` fuses like `dual` and expects the unaligned map as `mono`.
         hanging: bool [H, W], pixels whose monocular depth may verify but is left out where it would stand alone.
         most_vetoed: where more than this share of the geometric depths disagree, the monocular map is wrong, and all of
             them are verified; 1 is the paper.
         sigma_mono, sigma_geometric: relative standard deviations [H, W] of the two. Where they are left out, those of
             the paper: 0 at verified pixels and infinite elsewhere.
-
-    Raises:
-        D2Error: maps of two sizes, or an unknown variant.
     """
-    refuse_unknown("prior variant", [variant], VARIANTS)
-    if mono.shape != geometric.shape:
-        raise D2Error(f"monocular depth is {mono.shape}, geometric depth {geometric.shape}: bring both to one size")
     alone = mono if hanging is None else np.where(hanging, np.float32(0), mono)
     if variant == "mono":
         geometric, verified = np.zeros_like(geometric), alone > 0

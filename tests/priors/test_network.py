@@ -87,20 +87,18 @@ def test_the_fingerprint_changes_with_file_and_preprocessing(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize(
-    ("made", "given", "message"),
+    ("made", "message"),
     [
-        ({}, {"kind": "inverse"}, "unknown monocular kind 'inverse'"),
-        ({}, {"preprocessing": "imagenet"}, "unknown preprocessing 'imagenet'"),
-        ({"channels": 4}, {}, r"export a network whose input is \[1, 3, H, W\]"),
-        ({"channels": "h", "height": "w", "width": 3}, {}, r"takes \[1, 'h', 'w', 3\]: export a network whose"),
-        ({"batch": 4}, {}, "takes 4 images at once: export it with a batch of 1"),
-        ({"height": 200_000}, {}, "takes images of 80x200000, expected at most 8192 a side"),
-        ({"outputs": 2}, {}, r"returns \(1, 2, 60, 80\): expected one map"),
+        ({"channels": 4}, r"export a network whose input is \[1, 3, H, W\]"),
+        ({"channels": "h", "height": "w", "width": 3}, r"takes \[1, 'h', 'w', 3\]: export a network whose"),
+        ({"batch": 4}, "takes 4 images at once: export it with a batch of 1"),
+        ({"height": 200_000}, "takes images of 80x200000, expected at most 8192 a side"),
+        ({"outputs": 2}, r"returns \(1, 2, 60, 80\): expected one map"),
     ],
 )
-def test_what_is_no_monocular_network_is_refused(tmp_path: Path, made: dict, given: dict, message: str) -> None:
+def test_what_is_no_monocular_network_is_refused(tmp_path: Path, made: dict, message: str) -> None:
     path = tiny_onnx.mean_network(tmp_path / "net.onnx", **({"height": 60, "width": 80} | made))
-    refuses(message, lambda: MonocularModel(path, **({"kind": "relative"} | given)).predict(IMAGE))
+    refuses(message, lambda: MonocularModel(path, "relative").predict(IMAGE))
 
 
 def test_files_that_are_no_network_and_images_that_fill_the_memory_are_refused(tmp_path: Path) -> None:

@@ -8,16 +8,14 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from enum import StrEnum
-from typing import NamedTuple, get_args
+from typing import NamedTuple
 
 import numpy as np
 
-from d2_plugin.errors import D2Error, refuse_unknown
 from d2_plugin.priors.monocular.affine import AffineFit, fit_affine
 from d2_plugin.priors.monocular.settings import AlignSettings
 from d2_plugin.recordings.recording import MonoKind
 
-KINDS: tuple[MonoKind, ...] = get_args(MonoKind)
 RANKED = 4000
 """Anchors whose ranks are compared: the standard error is .016, and sorting stays below a millisecond."""
 MAX_ANCHORS = 20_000
@@ -98,11 +96,7 @@ def align(mono: np.ndarray, geometric: np.ndarray, *, kind: MonoKind, settings: 
         mono: D^m float [H, W]: inverse depth up to scale and shift (`relative`), or depth (`metric`).
         geometric: D^g float [H, W], planar depth, 0 or NaN where unknown.
         settings: residual, smoothing and when a fit is refused.
-
-    Raises:
-        D2Error: maps of two sizes, or an unknown kind.
     """
-    _check(mono, geometric, kind)
     fitted = _fitted(mono, geometric, kind, settings)
     if isinstance(fitted, Alignment):
         return fitted
@@ -131,7 +125,6 @@ def unjudged_line(
     mono: np.ndarray, geometric: np.ndarray, *, kind: MonoKind, settings: AlignSettings
 ) -> tuple[float, float]:
     """Scale and shift of `align` without the tests of whether they may be used; NaN without a line."""
-    _check(mono, geometric, kind)
     fitted = _fitted(mono, geometric, kind, settings)
     line = fitted if isinstance(fitted, Alignment) else fitted.fit
     return line.scale, line.shift
@@ -259,11 +252,3 @@ def _subsample(count: int) -> np.ndarray | slice:
 def _central_range(values: np.ndarray) -> float:
     """Width of the central 90 %: a handful of leverage points must not pass for spread."""
     return float(np.quantile(values, 0.95)) - float(np.quantile(values, 0.05))
-
-
-def _check(mono: np.ndarray, geometric: np.ndarray, kind: str) -> None:
-    if mono.shape != geometric.shape:
-        raise D2Error(
-            f"the monocular map is {mono.shape} but geometric depth is {geometric.shape}: resize the map first"
-        )
-    refuse_unknown("monocular kind", [kind], KINDS)

@@ -13,20 +13,18 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 
-from d2_plugin.errors import D2Error, refuse_unknown
+from d2_plugin.errors import D2Error
 from d2_plugin.extras import imported
-from d2_plugin.priors.monocular.align import KINDS
 from d2_plugin.priors.settings import Preprocessing
 from d2_plugin.reading import parsing
 from d2_plugin.recordings.images import opencv
 from d2_plugin.recordings.recording import MonoKind
 from d2_plugin.values import counted, shown
 
-PREPROCESSINGS: tuple[Preprocessing, ...] = get_args(Preprocessing)
 PATCH = 14  # side of a ViT patch: Depth Anything V2 takes sizes that are multiples of it
 LARGEST_INPUT = 8192  # pixels: a network that was exported for more fills the memory
 SHORT_SIDE = 518  # Depth Anything V2's lower bound of the shorter side, pixels
@@ -91,7 +89,7 @@ class MonocularModel:
         views: how many views of an instant it sees at once; None for a network of one image.
 
     Raises:
-        D2Error: no such file, no ONNX network, an input that is no image, or an unknown kind.
+        D2Error: no such file, no ONNX network, or an input that is no image.
         MissingExtra: onnxruntime is not installed.
     """
 
@@ -104,8 +102,6 @@ class MonocularModel:
         views: int | None = None,
     ) -> None:
         self.path, self.kind = Path(path), kind
-        refuse_unknown("monocular kind", [str(kind)], KINDS)
-        refuse_unknown("preprocessing", [preprocessing], PREPROCESSINGS)
         self.session = opened(self.path, threads, "monocular depth")
         self.input = NetworkInput.of(self.session, self.path, views)
         self.preprocessing = _recognised(self.input) if preprocessing == "auto" else preprocessing
