@@ -45,40 +45,23 @@ def confirm(
     `min_angle` and `max_angle`.
     """
     reference, depth = cameras[index], np.ascontiguousarray(depths[index], np.float32)
-    sums = _Sums(np.zeros(depth.shape, np.uint16), np.zeros(depth.shape), np.zeros(depth.shape))
-    for other, source in enumerate(cameras):
-        if other != index:
-            theirs = np.ascontiguousarray(depths[other], np.float32)
-            _add_source(sums, depth, theirs, reference, source, settings, tolerance)
-    spread = np.sqrt(sums.difference / (sums.information + (sums.information == 0)))
-    return Confirmation(sums.confirming, np.sqrt(sums.information), spread)
-
-
-class _Sums(NamedTuple):
-    """Over the sources so far: how many confirm, sum of P^2, and of P^2 times the squared relative difference."""
-
-    confirming: np.ndarray  # uint16 [H, W]
-    information: np.ndarray  # float64 [H, W]
-    difference: np.ndarray  # float64 [H, W]
-
-
-def _add_source(
-    sums: _Sums,
-    depth: np.ndarray,
-    theirs: np.ndarray,
-    reference: Camera,
-    source: Camera,
-    settings: StereoSettings,
-    tolerance: float,
-) -> None:
-    """Add the confirmation of `depth` [H, W] by one source to the sums."""
-    rays = np.linalg.inv(index_intrinsics(reference))
-    pair, back = view_pair(reference, source), view_pair(source, reference)
     low, high = np.deg2rad(settings.min_angle), np.deg2rad(settings.max_angle)
-    vectors = {"A": pair.A, "k": pair.k, "back_A": back.A, "back_k": back.k, "direction": pair.direction, "rays": rays}
-    angles = {"sine_min": np.sin(low), "cosine_min": np.cos(low), "sine_max": np.sin(high), "cosine_max": np.cos(high)}
-    limits = {"continuous": CONTINUOUS, "reprojection_max": REPROJECTION_MAX, "relative_depth_max": tolerance}
-    steps = {"between": settings.between_pixels, "nudge": np.exp(NUDGE), "nudge_squared": NUDGE**2}
-    sizes = dict(zip(("their_height", "their_width"), theirs.shape))
-    maps = {"depth": depth, "theirs": theirs, **sums._asdict()}
-    kernel.run("confirm", maps, **vectors, **angles, **limits, **steps, **sizes)
+    numbers: dict[str, float] = {"sine_min": np.sin(low), "cosine_min": np.cos(low)}
+    numbers |= {"sine_max": np.sin(high), "cosine_max": np.cos(high)}
+    numbers |= {"continuous": CONTINUOUS, "reprojection_max": REPROJECTION_MAX, "relative_depth_max": tolerance}
+    numbers |= {"between": settings.between_pixels, "nudge": np.exp(NUDGE), "nudge_squared": NUDGE**2}
+    # Over the sources: how many confirm, sum of P^2, and of P^2 times the squared relative difference.
+    confirming, information, difference = (np.zeros(depth.shape, kind) for kind in (np.uint16, float, float))
+    sums = {"confirming": confirming, "information": information, "difference": difference}
+    rays = np.linalg.inv(index_intrinsics(reference))
+    for other, source in enumerate(cameras):
+        if other == index:
+            continue
+        pair, back = view_pair(reference, source), view_pair(source, reference)
+        theirs = np.ascontiguousarray(depths[other], np.float32)
+        vectors = {"A": pair.A, "k": pair.k, "back_A": back.A, "back_k": back.k, "direction": pair.direction}
+        sizes = dict(zip(("their_height", "their_width"), theirs.shape))
+        maps = {"depth": depth, "theirs": theirs, **sums}
+        kernel.run("confirm", maps, rays=rays, **vectors, **numbers, **sizes)
+    spread = np.sqrt(difference / (information + (information == 0)))
+    return Confirmation(confirming, np.sqrt(information), spread)
