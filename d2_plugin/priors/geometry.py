@@ -11,14 +11,11 @@ so a plane sweep or an inverse-depth plane costs one homography each.
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
-from d2_plugin.errors import D2Error
 from d2_plugin.recordings.recording import Camera
 
 CONTINUOUS = 1.1
@@ -65,29 +62,11 @@ def relative_pose(reference: Camera, source: Camera) -> np.ndarray:
 
 
 def view_pair(reference: Camera, source: Camera) -> ViewPair:
-    """The homography parts A and k from `reference` to `source`; read-only arrays."""
-    return _view_pair(*(_Known(c.K.tobytes() + c.T_camera_world.tobytes(), c) for c in (reference, source)))
-
-
-@dataclass(frozen=True)
-class _Known:
-    """A camera as a key: equal where intrinsics and pose are, as they are now."""
-
-    numbers: bytes
-    camera: Camera = field(compare=False)
-
-
-@functools.lru_cache(maxsize=1024)
-def _view_pair(ours: _Known, theirs: _Known) -> ViewPair:
-    """See `view_pair`; the same pairs are needed at every frame, by matching, filter and evidence."""
-    reference, source = ours.camera, theirs.camera
+    """The homography parts A and k from `reference` to `source`."""
     T = relative_pose(reference, source)
     K_s, K_r = index_intrinsics(source), index_intrinsics(reference)
     R, t = T[:3, :3], T[:3, 3]
-    pair = ViewPair(K_s @ R @ np.linalg.inv(K_r), K_s @ t, -R.T @ t)
-    for array in (pair.A, pair.k, pair.direction):
-        array.flags.writeable = False
-    return pair
+    return ViewPair(K_s @ R @ np.linalg.inv(K_r), K_s @ t, -R.T @ t)
 
 
 def pixel_grid(camera: Camera, dtype: type = np.float32) -> tuple[np.ndarray, np.ndarray]:
@@ -129,38 +108,6 @@ def scaled_camera(camera: Camera, width: int, height: int) -> Camera:
     """The same camera with an image of another size; with centres at i + 0.5 the intrinsics only scale."""
     K = np.diag([width / camera.width, height / camera.height, 1.0]) @ camera.K
     return replace(camera, width=width, height=height, K=K)
-
-
-def check_depth_range(depth_range: tuple[float, float]) -> tuple[float, float]:
-    """The range as floats.
-
-    Raises:
-        D2Error: unless 0 < near < far and both are finite.
-    """
-    near, far = (float(bound) for bound in depth_range)
-    if not (np.isfinite(near) and np.isfinite(far) and 0 < near < far):
-        raise D2Error(
-            f"depth range must be 0 < near < far in world units, got near {near:g} and far {far:g}: swap or correct it"
-        )
-    return near, far
-
-
-def check_views(images: Sequence[np.ndarray], cameras: Sequence[Camera]) -> None:
-    """Refuse a list of images that does not belong to the list of cameras.
-
-    Raises:
-        D2Error: on unequal lengths, fewer than two views, or an image of another size than its camera.
-    """
-    if len(images) != len(cameras):
-        raise D2Error(f"stereo got {len(images)} images for {len(cameras)} cameras: pass one image per camera")
-    if len(images) < 2:
-        raise D2Error(f"stereo needs at least 2 cameras, got {len(images)}: use monocular depth alone for one camera")
-    for image, camera in zip(images, cameras):
-        if image.shape[:2] != (camera.height, camera.width):
-            raise D2Error(
-                f"image of camera {camera.name} is {image.shape[1]}x{image.shape[0]} pixels but its calibration says "
-                f"{camera.width}x{camera.height}: resize the image or correct the camera"
-            )
 
 
 def projected(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

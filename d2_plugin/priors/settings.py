@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, Literal
 
-from d2_plugin.priors.geometry import check_depth_range
+from d2_plugin.errors import D2Error
 from d2_plugin.priors.monocular.settings import AlignSettings
 from d2_plugin.priors.stereo.settings import StereoSettings
 from d2_plugin.recordings.recording import MonoKind
@@ -101,7 +101,12 @@ class PriorSettings(Settings):
         """Check each value, and that near is before far."""
         super().__post_init__()
         if self.depth_range is not None:
-            check_depth_range(self.depth_range)
+            near, far = self.depth_range
+            if not near < far:
+                raise D2Error(
+                    f"depth range must be 0 < near < far in world units, got near {near:g} and far {far:g}: swap or "
+                    "correct it"
+                )
 
     @classmethod
     def paper(cls, **changes: Any) -> PriorSettings:

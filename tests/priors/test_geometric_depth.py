@@ -10,8 +10,8 @@ from prior_cases import camera_at
 from refusals import refuses
 
 from benchmarks.stereo_rigs import textured_rig
-from d2_plugin.priors.geometry import check_depth_range, check_views, view_pair
-from d2_plugin.priors.settings import StereoSettings
+from d2_plugin.priors.geometry import view_pair
+from d2_plugin.priors.settings import PriorSettings, StereoSettings
 from d2_plugin.priors.stereo.depth_range import depth_bounds
 from d2_plugin.priors.stereo.filtering.filter import GeometricDepth
 from d2_plugin.priors.stereo.geometric_depth import geometric_depth, resampled
@@ -230,11 +230,4 @@ def test_a_projection_agrees_with_world_points_and_half_pixel_centres(u, v, dept
 
 @pytest.mark.parametrize("bounds", [(5.0, 1.0), (0.0, 1.0), (-1.0, 1.0), (1.0, 1.0), (1.0, np.inf), (np.nan, 2.0)])
 def test_an_impossible_depth_range_is_refused(bounds: tuple[float, float]) -> None:
-    refuses("0 < near < far", check_depth_range, bounds)
-
-
-def test_images_that_do_not_belong_to_the_cameras_are_refused() -> None:
-    image, pair = np.zeros((48, 64, 3), np.uint8), [uneven(), replace(uneven(1), name="b")]
-    refuses("one image per camera", check_views, [image], pair)
-    refuses("at least 2 cameras", check_views, [image], pair[:1])
-    refuses("camera b is 32x24 pixels", check_views, [image, image[::2, ::2]], pair)
+    refuses("0 < near < far|depth_range", PriorSettings, depth_range=bounds)

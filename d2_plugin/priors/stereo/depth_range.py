@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from d2_plugin.errors import D2Error
-from d2_plugin.priors.geometry import check_depth_range, projected, seen_by
+from d2_plugin.priors.geometry import projected, seen_by
 from d2_plugin.priors.stereo.settings import StereoSettings
 from d2_plugin.recordings.cameras.camera import rig_width, same_spot
 from d2_plugin.recordings.recording import Camera
@@ -51,7 +51,7 @@ def depth_bounds(
     declared = [camera.near_far for camera in cameras if camera.near_far is not None]
     if declared:
         near, far = min(bounds[0] for bounds in declared), max(bounds[1] for bounds in declared)
-        return DepthBounds(*check_depth_range((near * 0.8, far * 1.2)), "near and far of the data set")
+        return DepthBounds(near * 0.8, far * 1.2, "near and far of the data set")
     return _bounds_from_baselines(cameras, max_angle)
 
 

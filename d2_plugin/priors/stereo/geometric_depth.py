@@ -13,7 +13,7 @@ from itertools import repeat
 
 import numpy as np
 
-from d2_plugin.priors.geometry import check_views, scaled_camera
+from d2_plugin.priors.geometry import scaled_camera
 from d2_plugin.priors.stereo.filtering.confirm import RELATIVE_DEPTH
 from d2_plugin.priors.stereo.filtering.filter import GeometricDepth, filter_depths
 from d2_plugin.priors.stereo.patchmatch import patchmatch
@@ -47,11 +47,7 @@ def geometric_depth(
 
     Returns:
         Per camera the filtered depth; empty everywhere where nothing can be known (no texture, one centre).
-
-    Raises:
-        D2Error: fewer than two views, images of another size than their camera, an inverted range.
     """
-    check_views(images, cameras)
     grays = [gray(image) for image in images]
     by_scale = []
     for scale, memory in zip(SCALES, memories or repeat(None)):

@@ -16,7 +16,7 @@ from dataclasses import replace
 import numpy as np
 
 from d2_plugin.errors import D2Error
-from d2_plugin.priors.geometry import check_depth_range, check_views, view_pair
+from d2_plugin.priors.geometry import view_pair
 from d2_plugin.priors.stereo import patchmatch_cuda
 from d2_plugin.priors.stereo.patchmatch_kernel import PatchMatchKernel
 from d2_plugin.priors.stereo.pyramid import NO_MATCH, LevelView, at_resolution, levels, plane_depth
@@ -54,15 +54,11 @@ def patchmatch(
         that no other one meets at an angle has no depth anywhere.
 
     Raises:
-        D2Error: fewer than two views, an image of another size or type, an inverted depth range.
         NoCompiler: there is neither a GPU nor a C++ compiler.
     """
     settings = settings or StereoSettings()
-    check_views(grays, cameras)
-    near, far = check_depth_range(depth_range)
-    _check(grays)
-    sources = [choose_sources(index, cameras, (near, far), settings) for index in range(len(cameras))]
-    kernel = _kernel(settings)(sources, (near, far), settings)
+    sources = [choose_sources(index, cameras, depth_range, settings) for index in range(len(cameras))]
+    kernel = _kernel(settings)(sources, depth_range, settings)
     masks: Sequence[np.ndarray | None] = [None] * len(cameras) if wanted is None else wanted
     views: list[LevelView] = []
     for level, (divisor, rounds) in enumerate(levels(cameras, ROUNDS)):
@@ -127,12 +123,3 @@ def _kernel(settings: StereoSettings) -> type[PatchMatchKernel]:
     if settings.patchmatch_device == "cuda":
         raise D2Error(f"patchmatch_device = 'cuda', but {why_not}: set it to 'auto' or 'cpu'")
     return PatchMatchKernel
-
-
-def _check(grays: Sequence[np.ndarray]) -> None:
-    for gray in grays:
-        if gray.dtype != np.uint8 or gray.ndim != 2:
-            raise D2Error(
-                f"PatchMatch needs grey images as uint8 [H, W], got {gray.dtype} with {gray.ndim} dimensions: "
-                f"convert them with d2_plugin.priors.stereo.geometric_depth.gray"
-            )
