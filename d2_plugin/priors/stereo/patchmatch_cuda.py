@@ -27,7 +27,7 @@ from d2_plugin.priors.stereo.patchmatch_kernel import (
     Task,
 )
 
-PROGRAM = Program(KERNELS / "patchmatch.cu", tuple(path for path in HEADERS if path.name != "lanes.h"))
+PROGRAM = Program(KERNELS / "patchmatch.cu", HEADERS)
 
 FLAGS = ("--std=c++17", "--fmad=false")
 """No contraction: the kernels say themselves what is fused, so that all devices return the same bits."""

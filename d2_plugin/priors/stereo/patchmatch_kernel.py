@@ -23,7 +23,8 @@ FLAGS = ("-fopenmp-simd", "-ffp-contract=off")
 """No contraction: the kernels say themselves what is fused, so that all devices return the same bits."""
 
 SOURCES = [KERNELS / "patchmatch.cpp"]
-HEADERS = [KERNELS / name for name in ("numbers.h", "lanes.h", "planes.h", "matching.h", "spread.h")]
+HEADERS = tuple(KERNELS / name for name in ("numbers.h", "planes.h", "matching.h", "spread.h"))
+ON_CPU = (KERNELS / "lanes.h", KERNELS.parents[2] / "rasterizer" / "kernels" / "parallel.h")  # no import: shared alone
 
 MOST_PIXELS = 2**31 - 1
 """Of all sources together: their places are 32-bit integers."""
@@ -70,7 +71,7 @@ class PatchMatchKernel:
         self._start()
 
     def _start(self) -> None:
-        self.library = load_library("patchmatch", SOURCES, HEADERS, FLAGS)
+        self.library = load_library("patchmatch", SOURCES, HEADERS + ON_CPU, FLAGS)
 
     def match(self, views: Sequence[LevelView], index: int, stage: int, rounds: int, explore: bool) -> None:
         """Improve the planes of one view in place, after drawing them at stage 0; writes its cost.

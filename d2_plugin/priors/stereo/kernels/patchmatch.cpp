@@ -1,38 +1,26 @@
 // PatchMatch multi-view stereo on the CPU: the pixels of spread.h in threads, as many at once as a vector has lanes.
 // What they ask for (planes times sources) is packed and matched in the lanes: no sum runs across a vector.
 #include <algorithm>
-#include <atomic>
 #include <cstddef>
 #include <cstdint>
-#include <system_error>
-#include <thread>
 #include <vector>
 
 #include "lanes.h"  // before spread.h: templates find what is declared before them
+#include "parallel.h"
 #include "spread.h"
 
 namespace d2 {
 namespace {
 
-constexpr int kRowsAtOnce = 4;     // that a thread takes from the queue
-constexpr int kRowsPerThread = 16;  // fewer are not worth starting one
+constexpr int kRowsAtOnce = 4;  // of one piece of work
 
 // Calls work(top, bottom) in threads until all rows are done, those from top to bottom - 1 at a time.
 template <class Work>
 void parallel_rows(int rows, int threads, const Work& work) {
-  std::atomic<int> next{0};
-  const auto run = [&] {
-    for (int first; (first = next.fetch_add(kRowsAtOnce)) < rows;)
-      work(first, std::min(rows, first + kRowsAtOnce));
-  };
-  std::vector<std::thread> others;
-  try {
-    for (int t = 1; t < std::min(threads, rows / kRowsPerThread); t++) others.emplace_back(run);
-  } catch (const std::system_error&) {
-    // The system grants no more threads: those there are do all rows.
-  }
-  run();
-  for (std::thread& other : others) other.join();
+  parallel_for(threads, (rows + kRowsAtOnce - 1) / kRowsAtOnce, [&](int64_t part) {
+    const int top = int(part) * kRowsAtOnce;
+    work(top, std::min(rows, top + kRowsAtOnce));
+  });
 }
 
 // Where the pixels of a region lie, worked out by the compiler: GCC 13 vectorizes these loops wrongly, and places move.
