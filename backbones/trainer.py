@@ -13,8 +13,10 @@ import torch
 from torch import Tensor
 
 from d2_plugin.gaussians.photometric import photometric_loss
-from d2_plugin.rasterizer import Render, View
+from d2_plugin.rasterizer import View
 from d2_plugin.settings import Seed, Settings, Share, Steps
+
+from .model import SplatModel
 
 DISPENSED = 0.7
 """Share of a run after which Gaussians that the images would hardly miss go; the others make up for them."""
@@ -23,33 +25,6 @@ PASSES = 8
 
 JITTER_FROM = 1000
 """Steps of a run from which on Gaussians stand aside at random: a shorter one has still to find their places."""
-
-
-class Model(Protocol):
-    """What the loop needs of a backbone."""
-
-    def start_from(
-        self,
-        views: Sequence[View],
-        images: Callable[[int], Tensor],
-        recorded: Callable[[int], Tensor | None],
-    ) -> None: ...
-    def render(
-        self, view: View, background: Tensor | None = None, generator: torch.Generator | None = None
-    ) -> Render: ...
-    def regularization(self) -> Tensor | float: ...
-    def accumulate(self, view: View) -> None: ...
-    def optimize(self, step: int, iterations: int) -> None: ...
-    def densify(self, step: int, iterations: int, generator: torch.Generator) -> None: ...
-    def leave_out_dispensable(
-        self,
-        iterations: int,
-        views: Sequence[View],
-        image: Callable[[int], Tensor],
-        weights: Callable[[int], Tensor | None],
-    ) -> None: ...
-    def state_dict(self) -> dict[str, Any]: ...
-    def load_state_dict(self, state: Mapping[str, Any]) -> None: ...
 
 
 class Hooks(Protocol):
@@ -92,7 +67,7 @@ class Trainer:
 
     def __init__(
         self,
-        model: Model,
+        model: SplatModel,
         frames: Frames,
         settings: TrainSettings,
         attach: Callable[[Any], Hooks] | None = None,
