@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any, Protocol
+from typing import Any
 
 from d2_plugin.extras import is_installed
 
@@ -17,11 +17,16 @@ def show(*lines: str) -> None:
     sys.stdout.flush()
 
 
-class Bar(Protocol):
+class Bar:
     """One piece of work of known length."""
+
+    def __init__(self, shown: Callable[[int, str], Any]) -> None:
+        """`shown` shows how many units are done, and a note behind."""
+        self._shown = shown
 
     def update(self, done: int, note: str = "") -> None:
         """`done` units of work are finished; `note` is shown behind."""
+        self._shown(done, note)
 
 
 class _Lines:
@@ -32,7 +37,7 @@ class _Lines:
         self.last = time.monotonic()
         self._first: tuple[float, int] | None = None
 
-    def update(self, done: int, note: str = "") -> None:
+    def show(self, done: int, note: str) -> None:
         now = time.monotonic()
         since, before = self._first = self._first or (now, done)  # what starts workers is not repeated for each unit
         if now - self.last < 10 and done < self.total:
@@ -40,19 +45,6 @@ class _Lines:
         self.last = now
         left = f", {(now - since) / (done - before) * (self.total - done):.0f} s left" if done > before else ""
         sys.stderr.write(f"{self.title}: {done}/{self.total}{left} {note}\n")
-
-
-class _Rich:
-    def __init__(self, progress: Any, task: Any) -> None:
-        self._progress, self._task = progress, task
-
-    def update(self, done: int, note: str = "") -> None:
-        self._progress.update(self._task, completed=done, note=note)
-
-
-class _Nothing:
-    def update(self, done: int, note: str = "") -> None:
-        """Says nothing."""
 
 
 _silent = False
@@ -68,14 +60,15 @@ def be_silent() -> None:
 def progress_bar(title: str, total: int) -> Iterator[Bar]:
     """A bar for `total` units of work, written to stderr so that results on stdout stay clean."""
     if _silent:
-        yield _Nothing()
+        yield Bar(lambda done, note: None)
         return
     if not sys.stderr.isatty() or not is_installed("rich"):
-        yield _Lines(title, total)
+        yield Bar(_Lines(title, total).show)
         return
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, TextColumn("{task.fields[note]}"), console=Console(stderr=True)) as progress:
-        yield _Rich(progress, progress.add_task(title, total=total, note=""))
+        task = progress.add_task(title, total=total, note="")
+        yield Bar(lambda done, note: progress.update(task, completed=done, note=note))
