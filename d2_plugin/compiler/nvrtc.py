@@ -11,8 +11,6 @@ import functools
 import hashlib
 import importlib.util
 import logging
-import os
-import threading
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -23,6 +21,7 @@ import torch
 from d2_plugin.cache import cache_folder, check_private, is_trusted, private_cache
 from d2_plugin.compiler import CompileError
 from d2_plugin.compiler.prebuilt import digest_of
+from d2_plugin.durable import CannotWrite, write
 from d2_plugin.errors import D2Error
 
 logger = logging.getLogger(__name__)
@@ -168,13 +167,11 @@ def _read_entry(entry: Path) -> bytes | None:
 
 def _write_entry(entry: Path, code: bytes) -> None:
     """The checksum, then the code; renamed into place, so that processes which start together need no lock."""
-    written = entry.with_suffix(f".{os.getpid()}-{threading.get_ident()}")
     try:
         private_cache()
-        written.write_bytes(hashlib.sha256(code).digest() + code)
-        written.chmod(0o600)
-        written.replace(entry)
-    except OSError as error:
+        write(entry, hashlib.sha256(code).digest() + code)
+        entry.chmod(0o600)
+    except (OSError, CannotWrite) as error:
         logger.warning("cannot use the cache %s (%s): kernels are compiled in every process", entry.parent, error)
 
 
