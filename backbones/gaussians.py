@@ -36,11 +36,6 @@ class Gaussians:
         """Device of the parameters."""
         return next(iter(self.parameters.values())).device
 
-    def set_learning_rates(self, rates: Mapping[str, float]) -> None:
-        """Learning rates by name of tensor from the next step on; there may be more names than tensors."""
-        for group in self.optimizer.param_groups:
-            group["lr"] = rates[group["name"]]
-
     def append(self, rows: Mapping[str, Tensor]) -> None:
         """Add K rows (each tensor [K, ...]) at the end; their moments and statistics are zero."""
         count = len(next(iter(rows.values())))

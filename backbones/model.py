@@ -268,7 +268,8 @@ class SplatModel(ABC):
             self.appearance.optimize(share)
         rates = learning_rates(self.settings, self.extent, self.duration)
         rates["positions"] *= decayed(LAST_POSITION_RATE, step, iterations)
-        self.gaussians.set_learning_rates({name: share * rate for name, rate in rates.items()})
+        for group in self.gaussians.optimizer.param_groups:
+            group["lr"] = share * rates[group["name"]]
         for observer in self.observers:
             observer.optimized()
 

@@ -99,7 +99,7 @@ def _build_frame(sources: _Sources, store: PriorStore, number: int) -> Iterator[
     """Construct and store what is missing of one frame: (camera, whether it was built now), one after the other."""
     frame = Frame.read(sources.recording, list(sources.cameras), number)
     keys = sources.keys(frame)
-    missing = [name for name in keys if not store.is_current(name, number, keys[name])]
+    missing = [name for name in keys if store.entries.find_current(name, number, keys[name]) is None]
     for name in missing:
         if (old := _recorded(store, name, number)) is not None and old.get("key") != keys[name]:
             sources.say_replaced(old, store.path)

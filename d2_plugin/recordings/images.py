@@ -176,7 +176,8 @@ def _size(path: Path, data: bytes) -> tuple[int, int]:
     if data.startswith(_PNG_SIGNATURE) and len(data) >= 24:
         width, height = struct.unpack(">II", data[16:24])
     elif data.startswith(b"\xff\xd8"):
-        width, height = _jpeg_size(path, data)
+        position = _jpeg_segment(path, data, _JPEG_SIZE_MARKERS)
+        height, width = struct.unpack(">HH", data[position + 5 : position + 9])
     else:
         raise _unreadable(path)
     if not 0 < width * height <= MOST_PIXELS:
@@ -196,12 +197,6 @@ def _png_is_whole(data: bytes) -> bool:
             return True
         place = end + 4
     return False
-
-
-def _jpeg_size(path: Path, data: bytes) -> tuple[int, int]:
-    position = _jpeg_segment(path, data, _JPEG_SIZE_MARKERS)
-    height, width = struct.unpack(">HH", data[position + 5 : position + 9])
-    return width, height
 
 
 def _jpeg_segment(path: Path, data: bytes, markers: frozenset[int]) -> int:

@@ -121,12 +121,7 @@ def append_rows(path: Path, rows: Iterable[Row]) -> None:
             begin = file.read(1).strip()
         if begin not in (b"", b"{"):
             raise D2Error(f"{path} is no file of rows, one JSON object a line: give another --output")
-    append(path, "".join(as_line(row) for row in rows))
-
-
-def as_line(row: Row) -> str:
-    """A row as one line of JSON."""
-    return json_text(_plain(row), "the row") + "\n"
+    append(path, "".join(json_text(_plain(row), "the row") + "\n" for row in rows))
 
 
 def read_rows(paths: Sequence[Path]) -> list[Row]:

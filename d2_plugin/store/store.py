@@ -225,10 +225,6 @@ class PriorStore:
         pose = torch.tensor(described["T_camera_world"], dtype=torch.float64)
         return CameraRecord(torch.tensor(described["K"], dtype=torch.float64), pose)
 
-    def is_current(self, camera: str, frame: int, key: str) -> bool:
-        """Whether an intact prior built from exactly these inputs is there; a damaged one is named in the log."""
-        return self.entries.find_current(camera, frame, key) is not None
-
     def write(
         self, camera: str, frame: int, prior: FusedPrior, record: dict[str, Any], entries: EntryFolder | None = None
     ) -> None:

@@ -126,7 +126,7 @@ def test_what_is_damaged_is_named_on_open(store: PriorStore, part: str, kept: in
     array = r"camera a, frame 0 is damaged .* run `d2 priors` again"
     refuses(array if part == ".npy" else "cannot read the record .*00000.json", PriorStore.open, store.path)
     if part == ".json":
-        assert not store.is_current("a", 0, "k")
+        assert not store.entries.find_current("a", 0, "k")
 
 
 @pytest.mark.parametrize("part", [".npy", ".json"])
@@ -141,16 +141,16 @@ def test_what_is_damaged_can_be_read_around_while_it_is_built_again(store: Prior
 
 
 def test_an_array_whose_record_was_not_written_yet_is_not_trusted(store: PriorStore) -> None:
-    assert store.is_current("a", 0, "k")
-    assert not store.is_current("a", 0, "other")
+    assert store.entries.find_current("a", 0, "k")
+    assert not store.entries.find_current("a", 0, "other")
     record = array_file(store).with_suffix(".json")
     before = record.read_text()
     store.write("a", 0, some_prior(5), {"key": "k2"})
     record.write_text(before)  # as a kill between the two writes leaves it
-    assert not store.is_current("a", 0, "k")
+    assert not store.entries.find_current("a", 0, "k")
     record.unlink()
     assert PriorStore.open(store.path).prior("a", 0) is None
-    assert not store.is_current("a", 0, "k")
+    assert not store.entries.find_current("a", 0, "k")
 
 
 def test_stores_of_other_recordings_formats_and_other_folders_are_refused(store: PriorStore, tmp_path: Path) -> None:

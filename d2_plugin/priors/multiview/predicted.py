@@ -111,7 +111,9 @@ def understood(arrays: Mapping[str, np.ndarray], where: str, views: tuple[int, .
     if poses is not None:
         rows = 4 if poses.shape[-2:] == (4, 4) else 3
         poses = _shaped(poses, (count, rows, 4), "poses", where).astype(np.float64)[:, :3]
-        poses = poses if found["mask"] is None else _inverted(poses)
+        if found["mask"] is not None:  # MapAnything has them from the camera to the world
+            turned = poses[:, :, :3].transpose(0, 2, 1)
+            poses = np.concatenate([turned, -turned @ poses[:, :, 3:]], axis=2)
     if intrinsics is not None:
         intrinsics = _shaped(intrinsics, (count, 3, 3), "intrinsics", where).astype(np.float64)
     maps = np.where(known, maps, np.float32(np.nan))
@@ -122,9 +124,3 @@ def _shaped(values: np.ndarray, shape: tuple[int, ...], name: str, where: str) -
     if values.size != np.prod(shape):
         raise D2Error(f"{where} has {name} {values.shape}, expected {list(shape)} as its depth has it: {REMEDY}")
     return values.reshape(shape)
-
-
-def _inverted(poses: np.ndarray) -> np.ndarray:
-    """Rigid motions [V, 3, 4] the other way."""
-    turned = poses[:, :, :3].transpose(0, 2, 1)
-    return np.concatenate([turned, -turned @ poses[:, :, 3:]], axis=2)

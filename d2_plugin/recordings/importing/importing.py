@@ -228,7 +228,8 @@ def _notes_of_videos(settings: ImportSettings, videos: Mapping[str, VideoFile], 
         notes.append(
             f"frames of {halves} are two half images, so what moves has combs: deinterlace them (ffmpeg -vf bwdif)"
         )
-    for name, steady in steadiness(few).items():
+    for name in few.cameras:
+        steady = steadiness(few, name)
         if steady.moved:
             first, last = steady.between
             when = f"between {first:.2f} and {last:.2f} seconds of the recording"

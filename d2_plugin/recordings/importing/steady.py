@@ -29,12 +29,8 @@ class Steadiness(NamedTuple):
     drift: float  # brightest over darkest exposure, less 1
 
 
-def steadiness(recording: Recording) -> dict[str, Steadiness]:
-    """What some images say of each camera; medians over time hide what moves before it."""
-    return {name: _steadiness(recording, name) for name in recording.cameras}
-
-
-def _steadiness(recording: Recording, camera: str) -> Steadiness:
+def steadiness(recording: Recording, camera: str) -> Steadiness:
+    """What some images say of a camera; medians over time hide what moves before it."""
     cv2 = opencv("comparing images over time")
     scale = max(max(recording.cameras[camera].width, recording.cameras[camera].height) / LONG_SIDE, 1.0)
     taken = (recording.image(camera, frame) for frame in recording.frames)

@@ -170,7 +170,7 @@ def wall(count: int, shift: int = 0, gain: float = 1.0) -> list[np.ndarray]:
 def test_a_camera_that_was_moved_or_drifts_is_noticed(shift, gain, moved, drift) -> None:
     views = wall(24, shift, gain)
     recording = smooth_recording(("a",), 24, 160, 120)
-    steady = steadiness(showing(recording, {"image": lambda camera, frame: views[frame]}))["a"]
+    steady = steadiness(showing(recording, {"image": lambda camera, frame: views[frame]}), "a")
     assert 160 * steady.moved == pytest.approx(moved, abs=1)
     assert steady.drift == pytest.approx(drift, abs=0.02)
     assert not moved or steady.between[0] <= 0.5 <= steady.between[1]
@@ -195,8 +195,8 @@ def test_a_camera_that_is_bumped_by_half_a_degree_is_noticed_though_people_walk(
     whole = select_cameras(open_recording(shared_data(name)), (camera,))
     recording = select_frames(whole, spread(whole.frames, 9))
     first = recording.frames[5]
-    assert steadiness(recording)[camera].moved == 0
-    steady = steadiness(bumped(recording, first, 0.5))[camera]
+    assert steadiness(recording, camera).moved == 0
+    steady = steadiness(bumped(recording, first, 0.5), camera)
     assert steady.moved > 0
     assert steady.between[0] < first / recording.fps <= steady.between[1]
 
