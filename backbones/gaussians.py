@@ -18,8 +18,6 @@ class Gaussians:
     """
 
     def __init__(self, rows: Mapping[str, Tensor], learning_rates: Mapping[str, float]) -> None:
-        if rows.keys() != learning_rates.keys():
-            raise ValueError(f"rows {sorted(rows)} and learning rates {sorted(learning_rates)} name different tensors")
         self.parameters = {name: nn.Parameter(value.detach().clone()) for name, value in rows.items()}
         self.statistics: dict[str, Tensor] = {}
         groups = [{"params": [p], "lr": learning_rates[name], "name": name} for name, p in self.parameters.items()]

@@ -11,8 +11,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from d2_plugin.errors import D2Error
-
 SH_C0 = 0.28209479177387814
 """Y_0, the constant harmonic: a colour c in 0..1 is stored as the coefficient (c - 0.5) / Y_0."""
 
@@ -63,8 +61,7 @@ def colors(coefficients: Tensor, directions: Tensor, phase: Tensor | None, degre
     else:
         values = basis(torch.nn.functional.normalize(directions, dim=-1), degree)
     if time_degree:
-        if phase is None:
-            raise D2Error(f"colours with {time_degree} cosines in time need the phase of each Gaussian: pass it")
+        assert phase is not None, "see above"
         waves = torch.stack([torch.cos(phase * (2 * math.pi * n)) for n in range(time_degree + 1)], -1)
         values = (waves[:, :, None] * values[:, None]).flatten(1)
     return not_negative((values[..., None] * coefficients).sum(1) + 0.5)

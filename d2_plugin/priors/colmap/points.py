@@ -95,8 +95,6 @@ def triangulate(images: Sequence[np.ndarray], cameras: Sequence[Camera], frame: 
     Raises:
         MissingExtra: pycolmap is not installed.
     """
-    if len(images) != len(cameras):
-        raise D2Error(f"{len(images)} images for {len(cameras)} cameras: give one image per camera")
     pycolmap = import_pycolmap("triangulating sparse points", "stereo")
     with _quiet(pycolmap), tempfile.TemporaryDirectory(prefix="d2_sparse_") as folder:
         features = [_extract(pycolmap, image) for image in images]

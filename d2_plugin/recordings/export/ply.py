@@ -42,7 +42,6 @@ def write_point_cloud(path: Path, cloud: PointCloud) -> None:
     of a whole number of floats: hence alpha. The others ignore both.
     """
     count = len(cloud.positions)
-    cloud.check()
     layout = [(axis, "<f4") for axis in ("x", "y", "z", *_NORMALS)] + [(c, "u1") for c in _CHANNELS]
     layout += [("time", "<f4")] if cloud.times is not None else []
     rows = np.zeros(count, layout)
