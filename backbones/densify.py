@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated, Protocol
 
 import torch
 from torch import Tensor
 
 from d2_plugin.settings import Count, Every, Range, Settings, Share
 
-if TYPE_CHECKING:
-    from .model import SplatModel
+from .gaussians import Gaussians
 
 DENSE = 0.01
 """Gaussians larger than this share of the extent are split, smaller ones cloned."""
@@ -22,6 +22,18 @@ HUGE = 0.5
 """Gaussians larger than this share of the extent are pruned."""
 SHRINK = math.log(1.6)
 """What the log-scales of the two children of a split Gaussian are smaller by."""
+
+
+class Growable(Protocol):
+    """What density control needs of a model; `statistics` of its Gaussians hold `screen_gradient` and `seen`."""
+
+    gaussians: Gaussians
+    extent: float
+
+    def __len__(self) -> int: ...
+    def rotations(self, rows: Mapping[str, Tensor]) -> Tensor: ...
+    def append(self, rows: Mapping[str, Tensor]) -> None: ...
+    def select(self, index: Tensor) -> None: ...
 
 
 @dataclass(frozen=True)
@@ -44,9 +56,7 @@ class DensifySettings(Settings):
 
 
 @torch.no_grad()
-def densify(
-    model: SplatModel, settings: DensifySettings, step: int, iterations: int, generator: torch.Generator
-) -> None:
+def densify(model: Growable, settings: DensifySettings, step: int, iterations: int, generator: torch.Generator) -> None:
     """Clone, split and prune as scheduled; all structure changes go through model.append and model.select."""
     begun = settings.enabled and settings.start * iterations <= step <= settings.stop * iterations
     if not begun or step % settings.every:
@@ -57,7 +67,7 @@ def densify(
         value.zero_()
 
 
-def grow(model: SplatModel, settings: DensifySettings, generator: torch.Generator) -> None:
+def grow(model: Growable, settings: DensifySettings, generator: torch.Generator) -> None:
     """Clone small Gaussians with a large mean screen-space gradient, split large ones in two."""
     statistics = model.gaussians.statistics
     mean_gradient = statistics["screen_gradient"] / statistics["seen"].clamp(min=1)
@@ -78,7 +88,7 @@ def grow(model: SplatModel, settings: DensifySettings, generator: torch.Generato
         model.select(torch.nonzero(keep).squeeze(-1))
 
 
-def prune(model: SplatModel, faint: float = FAINT) -> None:
+def prune(model: Growable, faint: float = FAINT) -> None:
     """Remove Gaussians that are nearly transparent or as large as the scene."""
     raw = model.gaussians
     opaque = torch.sigmoid(raw["opacity_logits"]) >= faint
@@ -87,7 +97,7 @@ def prune(model: SplatModel, faint: float = FAINT) -> None:
         model.select(torch.nonzero(keep).squeeze(-1))
 
 
-def _scatter_children(model: SplatModel, rows: dict[str, Tensor], children: slice, generator: torch.Generator) -> None:
+def _scatter_children(model: Growable, rows: dict[str, Tensor], children: slice, generator: torch.Generator) -> None:
     """Move split children to samples of their parent Gaussian (in 4D where there is time) and shrink them."""
     parents = {name: value[children] for name, value in rows.items()}
     rotations = model.rotations(parents)
