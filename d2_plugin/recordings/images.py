@@ -94,7 +94,6 @@ def read_mask(path: Path) -> np.ndarray:
 
 def write_mask(path: Path, mask: np.ndarray) -> None:
     """Write a mask [H, W] in 0..1, or of true and false, as a grey image."""
-    path.parent.mkdir(parents=True, exist_ok=True)
     grey = np.rint(mask.astype(np.float32) * 255).astype(np.uint8)
     write_png(path, np.repeat(grey[..., None], 3, axis=2))
 

@@ -43,9 +43,7 @@ class Export:
         """Every frame (or those given) of every camera as a lossless PNG at `place(camera, frame)`."""
         for camera in self.recording.cameras:
             for frame in self.recording.frames if frames is None else frames:
-                target = place(camera, frame)
-                target.parent.mkdir(parents=True, exist_ok=True)
-                write_png(target, self.recording.image(camera, frame))
+                write_png(place(camera, frame), self.recording.image(camera, frame))
 
     def written(self, cameras: Mapping[str, str] | None = None, frames: Mapping[int, int] | None = None) -> Written:
         """What a writer returns; names that are not given were kept."""

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from d2_plugin.durable import write
 from d2_plugin.errors import D2Error
 from d2_plugin.recordings.cameras.rotations import quaternion_of_rotation
 from d2_plugin.recordings.export.base import Export, Written, refuse_off_centre
@@ -53,8 +54,7 @@ def write_multipleview(export: Export) -> Written:
     for name in kept:
         for index, frame in enumerate(export.recording.frames):
             path = export.folder / names[name] / f"frame_{index + 1:05d}.jpg"
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(encode_jpeg(export.recording.image(name, frame), JPEG_QUALITY))
+            write(path, encode_jpeg(export.recording.image(name, frame), JPEG_QUALITY), synced=False)
     # Its reader takes the digits behind the fifth letter of an image's name for the number of the camera.
     images = {f"image{index + 1}.jpg": camera for index, camera in enumerate(kept.values())}
     write_model(export.folder / "sparse_", images, export.cloud)
