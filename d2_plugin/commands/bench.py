@@ -14,9 +14,7 @@ from d2_plugin.commands.arguments.form import HELP, Form, ModuleCommand
 from d2_plugin.errors import D2Error, refuse_unknown
 from d2_plugin.settings import Positional, Settings
 
-TRAINING = ModuleCommand(
-    "d2_plugin.runs.training.bench", "TrainingBench", "D², stereo alone and the backbone at equal time"
-)
+TRAINING = ModuleCommand("d2_plugin.runs.training.bench", "TrainingBench")
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""`d2 export-recording`: a recording in the input layout of another repository, with points to start from."""
+"""Write a recording in the input layout of another 4D Gaussian Splatting repository."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`d2 export`: a trained run as files that others open; see `FORMATS`."""
+"""Write a trained run as a web page that plays it, or as files that other viewers open."""
 
 from __future__ import annotations
 
