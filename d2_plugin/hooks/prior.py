@@ -40,17 +40,12 @@ Key = tuple[str, int]
 Belief = Literal["all", "stereo", "nothing"]
 """What of a prior is believed: `all` of it, `stereo` alone, or `nothing`."""
 
-BELIEVED: dict[str, tuple[Label, ...]] = {"stereo": (Label.VERIFIED,), "nothing": ()}
-"""Labels of the pixels that keep their depth, where not all do."""
-
 
 def believed(prior: DepthPrior, belief: Belief) -> DepthPrior:
     """The prior with those pixels left empty whose source is not believed."""
     if belief == "all":
         return prior
-    kept = torch.zeros_like(prior.labels, dtype=torch.bool)
-    for label in BELIEVED[belief]:
-        kept |= prior.labels == label
+    kept = prior.labels == Label.VERIFIED if belief == "stereo" else torch.zeros_like(prior.labels, dtype=torch.bool)
     depth, labels = (torch.where(kept, map_, torch.zeros_like(map_)) for map_ in (prior.depth, prior.labels))
     return prior._replace(depth=depth, labels=labels)
 

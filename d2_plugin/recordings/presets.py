@@ -31,7 +31,6 @@ class Rig(NamedTuple):
 
     order: tuple[str, ...]
     spare: tuple[str, ...]
-    held_out: tuple[str, ...]  # never trained on: what dense-view comparisons test with
     source: str
 
 
@@ -39,7 +38,6 @@ RIGS = {
     "n3dv": Rig(
         order=("cam01", "cam13", "cam10", "cam20"),
         spare=("cam12", "cam14", "cam03", "cam08", "cam05"),
-        held_out=("cam00",),
         source="four views as 4C4D's default; two and three are this project's choice among them",
     ),
 }
