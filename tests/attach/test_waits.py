@@ -20,7 +20,7 @@ from d2_plugin import D2Hooks
 from d2_plugin.config import D2Config, DepthLossConfig, MotionConfig, ParallaxConfig
 from d2_plugin.hooks.densify import DensifyConfig
 from d2_plugin.hooks.prune import PruneConfig
-from d2_plugin.protocol import Splats
+from d2_plugin.protocol import DepthPrior, Splats
 from d2_plugin.rasterizer import MOST_IN_TORCH, cuda, native, rasterize, survey
 
 ONE_MORE = {"swift4d", "gsplat_dynamic"}
@@ -196,4 +196,5 @@ def test_a_million_gaussians_without_kernels_are_refused(on_gpu: bool, monkeypat
     draw(10)
     sentence = rf"{MOST_IN_TORCH + 1} Gaussians on {'cuda:0' if on_gpu else 'cpu'} and no compiled kernels: plain torch"
     refuses(sentence, draw, MOST_IN_TORCH + 1)
-    refuses(sentence, survey, splats(MOST_IN_TORCH + 1), view, None)
+    prior = DepthPrior(*torch.zeros(2, view.height, view.width))
+    refuses(sentence, survey, splats(MOST_IN_TORCH + 1), view, prior)

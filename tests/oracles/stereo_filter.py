@@ -1,6 +1,8 @@
 """The filter of geometric depth in NumPy: the bits that `d2_plugin.priors.stereo.filtering.kernel` must return."""
 
 import itertools
+from collections.abc import Sequence
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -8,7 +10,7 @@ import numpy as np
 from benchmarks.stereo_rigs import sample_nearest
 from d2_plugin.priors.geometry import CONTINUOUS, Projection, ViewPair, view_pair, viewing_rays
 from d2_plugin.priors.stereo.filtering import precision
-from d2_plugin.priors.stereo.filtering.confirm import NUDGE, REPROJECTION_MAX
+from d2_plugin.priors.stereo.filtering.confirm import NUDGE, RELATIVE_DEPTH, REPROJECTION_MAX, Confirmation
 from d2_plugin.priors.stereo.settings import StereoSettings
 from d2_plugin.recordings.recording import Camera
 
@@ -71,10 +73,29 @@ def _vertical_slope(inverse: Map, reach: int) -> Map:
     return (np.where(np.isfinite(flatter) & (inverse > 0), flatter, 0) / np.float32(reach)).astype(np.float32)
 
 
+def confirm(
+    index: int,
+    cameras: Sequence[Camera],
+    depths: Sequence[Map],
+    settings: StereoSettings,
+    tolerance: float = RELATIVE_DEPTH,
+) -> Confirmation:
+    """What the other views say of the depth of view `index`: the bits of the kernel."""
+    shape = depths[index].shape
+    sums = SimpleNamespace(
+        confirming=np.zeros(shape, np.uint16), information=np.zeros(shape), difference=np.zeros(shape)
+    )
+    for other, source in enumerate(cameras):
+        if other != index:
+            add_source(sums, depths[index], depths[other], cameras[index], source, settings, tolerance)
+    spread = np.sqrt(sums.difference / np.where(sums.information > 0, sums.information, 1))
+    return Confirmation(sums.confirming, np.sqrt(sums.information), spread)
+
+
 def add_source(
     sums: Any, depth: Map, theirs: Map, reference: Camera, source: Camera, settings: StereoSettings, tolerance: float
 ) -> None:
-    """Add what one source says of `depth` [H, W] to the sums: the bits of the kernel."""
+    """Add what one source says of `depth` [H, W] to the sums."""
     v, u = np.indices(depth.shape, np.float32)
     pair, way_back = view_pair(reference, source), view_pair(source, reference)
     forth = pair.project(u, v, depth)

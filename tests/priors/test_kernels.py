@@ -40,7 +40,7 @@ def assert_is_the_oracle(compiled: Callable[..., list[np.ndarray]], *given: obje
     ours = compiled(*given)
     with pytest.MonkeyPatch.context() as patch, np.errstate(all="ignore"):  # of pixels that are masked afterwards
         patch.setattr(kernel, "run", oracle.run)
-        patch.setattr(confirm, "_add_source", oracle.add_source)
+        patch.setattr(confirm, "confirm", oracle.confirm)
         theirs = compiled(*given)
     for one, other in zip(ours, theirs, strict=True):
         assert one.dtype == other.dtype
