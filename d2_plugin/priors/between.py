@@ -43,7 +43,7 @@ from d2_plugin.store.store import QUARTERS, PriorStore
 if TYPE_CHECKING:
     from d2_plugin.priors.flow_network import FlowNetwork
 
-VERSION = 5
+VERSION = 6
 """Of what is made from the same priors; raise it when that changes."""
 
 MOVES = 0.6
@@ -54,6 +54,9 @@ CONTRADICTS = 40
 """The two accounts of a pixel contradict each other if a channel differs by more than this."""
 MOST_CHANGED = 0.5
 """Where more of an image changes, it is the light that changes, and nothing is known."""
+LEAST_FOLLOWED = 0.5
+"""Where less of what stands before the still image is followed, by flow or as a region, the instants lie too far apart:
+nothing is known of the rectangle that holds it."""
 LAYERS = (1e-3, 1.0, 30.0, 1e3)
 """Weights of still pixels, moving ones, regions and what flies where they meet: what moves lies in front."""
 SMOOTH = 2.0
@@ -187,19 +190,29 @@ class CameraMotion:
         if changed.mean() > MOST_CHANGED:
             unknown = np.full(changed.shape, Label.CONFLICT, np.uint8)
             return dict.fromkeys(QUARTERS, replace(empty_prior(changed.shape), labels=unknown, colors=images[0]))
-        for image in images:
-            changed |= foreground(image, self.still)
+        fronts = np.stack([foreground(image, self.still) for image in images])
+        changed |= fronts.any(0)
         layers = [(np.hypot(flow[..., 0], flow[..., 1]) > MOVES).astype(np.uint8) for flow in flows]
         moving = self._moving(index)
         for region, passage in moving:
             layers[0].flat[region.start] = layers[1].flat[region.end] = 2 if passage is None else 3
         ends = [_Side(*side, 0.0) for side in zip(priors, images, flows, layers)]
         curves = self._curves(index)
-        maps = changed, difference >= CONTRADICTS, images[0].astype(int) << 8 | images[1]
+        maps = changed, difference >= CONTRADICTS, images[0].astype(int) << 8 | images[1], self._lost(index, fronts)
         return {
             quarter: _composed(self._sides(ends, curves, moving, acceleration, quarter / 4), *maps)
             for quarter in QUARTERS
         }
+
+    def _lost(self, index: int, fronts: np.ndarray) -> np.ndarray:
+        """Where nothing is known of the way [H, W], since hardly anything of what is in front [2, H, W] is followed."""
+        known, lost = np.stack(self._ends(index).follows), np.zeros(fronts.shape[1:], bool)
+        for region in self.regions[index]:
+            known[0].flat[region.start] = known[1].flat[region.end] = True
+        if fronts.any() and known[fronts].mean() < LEAST_FOLLOWED:
+            left, top, width, height = opencv("scene flow").boundingRect(fronts.any(0).view(np.uint8))
+            lost[top : top + height, left : left + width] = True
+        return lost
 
     def flow(self, index: int) -> np.ndarray:
         """How far each pixel goes from one instant of an interval to the next, [H, W, 2] pixels."""
@@ -324,8 +337,11 @@ class _Side(NamedTuple):
     weight: float
 
 
-def _composed(sides: Sequence[_Side], changed: np.ndarray, unlike: np.ndarray, pairs: np.ndarray) -> FusedPrior:
-    """The image from both instants' accounts, with the depth of what moves; `changed` [H, W] says where.
+def _composed(
+    sides: Sequence[_Side], changed: np.ndarray, unlike: np.ndarray, pairs: np.ndarray, lost: np.ndarray
+) -> FusedPrior:
+    """The image from both instants' accounts, with the depth of what moves; `changed` [H, W] says where, `lost` [H, W]
+    where neither account counts.
 
     Where the weight is that of still pixels alone, and these are not `unlike` [H, W], the colours are looked up by
     `pairs` [H, W, 3]: 256 times the earlier one, and the later one.
@@ -341,7 +357,7 @@ def _composed(sides: Sequence[_Side], changed: np.ndarray, unlike: np.ndarray, p
     compared = (least > 1e-2 * LAYERS[0]) & (least <= 0.1 * LAYERS[2]) & (most <= 0.1 * LAYERS[3])
     differ[mixed] = compared & (np.abs(colors[0] - colors[1]).max(0) > CONTRADICTS)
     together = accounts[0] + accounts[1]
-    unknown = opencv("scene flow").blur(differ, (3, 3)) > 0.3
+    unknown = lost | (opencv("scene flow").blur(differ, (3, 3)) > 0.3)
     unknown[mixed] |= together[3] <= 0.1 * LAYERS[0]
     kept, origin = changed.copy(), _origin(sides)
     kept[mixed] |= together[3] > LAYERS[1] / 2

@@ -259,6 +259,19 @@ class TestHalfway:
         assert (labels[22:38, 82:108] == Label.CONFLICT).float().mean() > 0.5
         assert (labels[45:, :70] == Label.EMPTY).all()
 
+    def test_of_what_goes_too_far_for_flow_and_regions_nothing_is_known(self, tmp_path: Path) -> None:
+        """A thing with another face at each instant: nothing of it is found back, and its way is not the wall's."""
+        rng, images = np.random.default_rng(2), {}
+        for frame, left in enumerate((20, 90, 30)):
+            images[frame] = wall()
+            images[frame][20:50, left : left + 25] = rng.integers(0, 255, (30, 25, 3))
+        store = thrown(tmp_path, 3, changes=images)
+        build_between(store)
+        halfway = store.underway("cam0", 0, 2)[1]
+        assert (halfway.labels[20:50, 20:115] == Label.CONFLICT).all()
+        assert not halfway.depth[20:50, 20:115].any()
+        assert (halfway.labels[:, 130:] == Label.EMPTY).all()
+
     def test_of_light_that_changes_everywhere_nothing_is_known(self, tmp_path: Path) -> None:
         store = thrown(tmp_path, 3, changes={2: shown() + 60})
         build_between(store)
