@@ -43,7 +43,7 @@ from d2_plugin.store.store import QUARTERS, PriorStore
 if TYPE_CHECKING:
     from d2_plugin.priors.flow_network import FlowNetwork
 
-VERSION = 7
+VERSION = 6
 """Of what is made from the same priors; raise it when that changes."""
 
 MOVES = 0.6
