@@ -39,6 +39,7 @@ class Lpips:
     """Learned perceptual distance of two images; `net` is `alex` or `vgg`."""
 
     def __init__(self, net: str, features: Path, linear: Path) -> None:
+        refuse_unknown("LPIPS network", [net], _TAPS)
         self.net = net
         with torch.device("meta"):  # no random initial weights, which would advance the global random state
             self.layers = _alexnet() if net == "alex" else _vgg16()

@@ -115,6 +115,11 @@ def flicker(image: Tensor, truth: Tensor, image_before: Tensor, truth_before: Te
     """
     first, second = _pair(image, truth)
     first_before, second_before = _pair(image_before, truth_before)
+    if first.shape != first_before.shape:
+        raise D2Error(
+            f"images of shape {tuple(image.shape)} and {tuple(image_before.shape)} are no two frames of one camera: "
+            "give frames of equal size"
+        )
     return float(np.abs((first - first_before) - (second - second_before)).mean())
 
 
@@ -145,6 +150,8 @@ def depth_delta1(depth: Tensor, truth: Tensor) -> float | None:
 
 def _known_depths(depth: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
     """Rendered (0 = missing) and true depth, float64, at the pixels that have a true one."""
+    if depth.shape != truth.shape:
+        raise D2Error(f"rendered depth {tuple(depth.shape)} and truth {tuple(truth.shape)} differ: compare equal sizes")
     known = torch.isfinite(truth) & (truth > 0)
     rendered = depth[known].double()
     return torch.where(torch.isfinite(rendered), rendered, 0.0), truth[known].double()
@@ -198,6 +205,13 @@ def _filtered(values: np.ndarray, taps: Sequence[float], axis: int) -> np.ndarra
 
 def _pair(image: Tensor, truth: Tensor, window: int = 1) -> tuple[np.ndarray, np.ndarray]:
     """Both images as [3, H, W] float64 (in float32 the variances of flat regions would be rounding noise)."""
+    if not isinstance(image, Tensor) or not isinstance(truth, Tensor):
+        kinds = f"{type(image).__name__} and {type(truth).__name__}"
+        raise D2Error(f"images are compared as tensors [H, W, 3], got {kinds}: give two tensors")
+    if image.shape != truth.shape or image.ndim != 3 or image.shape[2] != 3:
+        raise D2Error(
+            f"images of shape {tuple(image.shape)} and {tuple(truth.shape)} cannot be compared: give two [H, W, 3]"
+        )
     if min(image.shape[:2]) < window:
         raise D2Error(
             f"an image of {image.shape[1]}x{image.shape[0]} pixels is smaller than the {window}x{window} window "

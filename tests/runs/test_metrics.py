@@ -67,6 +67,19 @@ def test_a_window_larger_than_the_image_is_refused(metric: Callable[..., float],
     refuses(f"40x{size - 1} pixels is smaller than the {size}x{size} window", metric, small, small)
 
 
+@pytest.mark.parametrize(
+    ("metric", "sizes", "message"),
+    [
+        (metrics.psnr, ((8, 8, 3), (8, 9, 3)), "cannot be compared"),
+        (metrics.psnr, ((3, 8, 8), (3, 8, 8)), "cannot be compared"),
+        (metrics.depth_absrel, ((8, 8), (4, 4)), "differ: compare equal sizes"),
+        (metrics.flicker, ((4, 4, 3), (4, 4, 3), (8, 4, 3), (8, 4, 3)), "no two frames of one camera"),
+    ],
+)
+def test_what_cannot_be_compared_is_refused(metric, sizes, message) -> None:
+    refuses(message, metric, *map(torch.rand, sizes))
+
+
 def test_flip_is_nvidias_own_and_without_its_package_it_is_not_measured(monkeypatch: pytest.MonkeyPatch) -> None:
     a, b = sine_pair()
     with monkeypatch.context() as patch:
