@@ -54,7 +54,7 @@ CONTRADICTS = 40
 """The two accounts of a pixel contradict each other if a channel differs by more than this."""
 MOST_CHANGED = 0.5
 """Where more of an image changes, it is the light that changes, and nothing is known."""
-LEAST_FOLLOWED = 0.6
+LEAST_FOLLOWED = 0.4
 """Where less of what stands before the still image is followed, by flow or as a region, the instants lie too far apart:
 nothing is known of the rectangle that holds it."""
 LAYERS = (1e-3, 1.0, 30.0, 1e3)
