@@ -232,16 +232,6 @@ class SplatModel(ABC):
             return render
         return render._replace(color=render.color + (1 - render.alpha)[..., None] * change[:, 3])
 
-    def start_from(
-        self,
-        views: Sequence[View],
-        images: Callable[[int], Tensor],
-        recorded: Callable[[int], Tensor | None] = lambda index: None,
-    ) -> None:
-        """Before the first step: colours of the background from the training images, see `Background.start_from`."""
-        if self.background is not None:
-            self.background.start_from(views, images, recorded)
-
     def regularization(self) -> Tensor | float:
         """A term of the training loss that concerns no image; 0.0 where there is none."""
         return 0.0

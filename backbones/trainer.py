@@ -74,7 +74,8 @@ class Trainer:
     ) -> None:
         self.model, self.frames, self.settings = model, frames, settings
         self.step = 0
-        model.start_from(frames.views, frames.image, getattr(frames, "recorded", lambda index: None))
+        if model.background is not None:
+            model.background.start_from(frames.views, frames.image, getattr(frames, "recorded", lambda index: None))
         self.loss: Tensor | None = None
         """The last step's loss with all its terms, for whoever watches that it stays finite."""
         self._generator = torch.Generator().manual_seed(settings.seed)

@@ -14,7 +14,9 @@ from d2_plugin.commands.arguments.form import HELP, Form, ModuleCommand
 from d2_plugin.errors import D2Error, refuse_unknown
 from d2_plugin.settings import Positional, Settings
 
-TRAINING = ModuleCommand("d2_plugin.runs.training.bench", "TrainingBench")
+TRAINING = ModuleCommand(
+    "d2_plugin.runs.training.bench", "TrainingBench", "D², stereo alone and the backbone at equal time"
+)
 
 
 @dataclass(frozen=True)

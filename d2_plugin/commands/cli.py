@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import ast
 import importlib
 import os
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 from types import ModuleType
 
 from d2_plugin import __version__
@@ -17,25 +15,55 @@ from d2_plugin.commands.arguments.help import entry, help_text
 from d2_plugin.errors import D2Error, refuse_unknown
 
 COMMANDS: dict[str, str | ModuleCommand] = {
-    "demo": ModuleCommand("d2_plugin.viewing.demo", "Demo"),
-    "import": ModuleCommand("d2_plugin.commands.import_", "ImportSettings"),
+    "demo": ModuleCommand(
+        *("d2_plugin.viewing.demo", "Demo"),
+        "A synthetic recording, trained by the backbone alone and with D2: a table, an image and a player.",
+    ),
+    "import": ModuleCommand(
+        *("d2_plugin.commands.import_", "ImportSettings"),
+        "Turn videos into a recording: where the cameras stand, one clock for all of them, images, exposures.",
+    ),
     "plan": "plan",
     "priors": "priors",
     "train": "train",
-    "eval": ModuleCommand("d2_plugin.commands.eval", "Evaluation"),
-    "render": ModuleCommand("d2_plugin.viewing.videos.render", "RenderSettings"),
-    "view": ModuleCommand("d2_plugin.viewing.live.show", "ViewSettings"),
-    "compare": ModuleCommand("d2_plugin.commands.compare", "Comparison"),
+    "eval": ModuleCommand(
+        "d2_plugin.commands.eval", "Evaluation", "Score the held-out cameras of a trained run again."
+    ),
+    "render": ModuleCommand(
+        *("d2_plugin.viewing.videos.render", "RenderSettings"),
+        "A video of a run: its held-out cameras, or a camera that moves; depth, errors, several runs together.",
+    ),
+    "view": ModuleCommand(
+        *("d2_plugin.viewing.live.show", "ViewSettings"),
+        "A page in the browser that shows a run, a recording or a depth prior, in space and time.",
+    ),
+    "compare": ModuleCommand(
+        "d2_plugin.commands.compare", "Comparison", "One Markdown table of the scores of several runs; a page of two."
+    ),
     "ablate": "ablate",
     "bench": "bench",
-    "protocol": ModuleCommand("d2_plugin.commands.protocol", "ProtocolRun"),
-    "report": ModuleCommand("d2_plugin.runs.report.report", "ReportSettings"),
-    "export": ModuleCommand("d2_plugin.viewing.export.export", "Export"),
-    "export-recording": ModuleCommand("d2_plugin.commands.export_recording", "RecordingExport"),
-    "doctor": ModuleCommand("d2_plugin.commands.doctor", "Doctor"),
+    "protocol": ModuleCommand(
+        *("d2_plugin.commands.protocol", "ProtocolRun"),
+        "A published evaluation on N3DV by its name: its cameras, size, frames, steps and metrics, and what differs.",
+    ),
+    "report": ModuleCommand(
+        "d2_plugin.runs.report.report", "ReportSettings", "One page of everything measured: plots, tables, images."
+    ),
+    "export": ModuleCommand(
+        *("d2_plugin.viewing.export.export", "Export"),
+        "Write a trained run as a web page that plays it, or as files that other viewers open.",
+    ),
+    "export-recording": ModuleCommand(
+        *("d2_plugin.commands.export_recording", "RecordingExport"),
+        "Write a recording in the input layout of another 4D Gaussian Splatting repository.",
+    ),
+    "doctor": ModuleCommand(
+        *("d2_plugin.commands.doctor", "Doctor"),
+        "What is installed and what is missing for which feature, or for a trainer.",
+    ),
 }
-"""Name -> what serves it, whose docstring is the help: a module beside this file, whose `form(words)` says what it
-takes, or any module with settings and `run`."""
+"""Name -> what serves it: a module beside this file, whose docstring is the help and whose `form(words)` says what it
+takes; or any module with settings and `run`."""
 
 NEEDED = (3, 11)
 """The Python of the commands; a trainer's process, which imports none of them, may be older."""
@@ -77,10 +105,7 @@ def _overview() -> str:
 
 
 def _about(command: str | ModuleCommand) -> str:
-    """The first line of the help, from the source: to import what serves all commands takes seconds."""
-    module = command.module if isinstance(command, ModuleCommand) else f"d2_plugin.commands.{command}"
-    path = Path(__file__).parents[1].joinpath(*module.split(".")[1:]).with_suffix(".py")
-    return (ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or "").partition("\n")[0]
+    return command.help if isinstance(command, ModuleCommand) else (_module(command).__doc__ or "").partition("\n")[0]
 
 
 def _module(name: str) -> ModuleType:

@@ -1,4 +1,4 @@
-"""One Markdown table of the scores of several runs; a page of two."""
+"""One Markdown table of the scores of several runs, and a page that shows two of them beside each other."""
 
 from __future__ import annotations
 

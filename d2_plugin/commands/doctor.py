@@ -1,4 +1,4 @@
-"""What is installed and what is missing for which feature, or for a trainer.
+"""What is installed and what is missing for which feature.
 
 With --attach REPOSITORY PATH: what that trainer imports and this environment lacks, and how to get it.
 """

@@ -1,4 +1,4 @@
-"""Write a recording in the input layout of another 4D Gaussian Splatting repository."""
+"""`d2 export-recording`: a recording in the input layout of another repository, with points to start from."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A published evaluation on N3DV by its name: its cameras, size, frames, steps and metrics, and what differs."""
+"""A published evaluation on N3DV by its name: cameras, size, frames and steps of its code, priors, runs, scores."""
 
 from __future__ import annotations
 

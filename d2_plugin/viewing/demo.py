@@ -1,4 +1,4 @@
-"""A synthetic recording, trained by the backbone alone and with D2: a table, an image and a player."""
+"""`d2 demo`: a synthetic recording, the backbone alone and with D2, a table, an image and a player."""
 
 from __future__ import annotations
 

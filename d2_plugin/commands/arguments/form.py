@@ -166,7 +166,7 @@ class ModuleCommand(NamedTuple):
     module: str
     settings: str
     """Name of the class of settings in that module."""
-    help: str = ""
+    help: str
 
     def form(self, command: str) -> Form:
         """What it takes; the docstring of its module is the text above the help."""

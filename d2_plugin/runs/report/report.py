@@ -1,4 +1,4 @@
-"""One page of everything measured: plots, tables, images."""
+"""`d2 report`: everything that was measured as one page, with plots, tables and images, from rows and run folders."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Write a trained run as a web page that plays it, or as files that other viewers open."""
+"""`d2 export`: a trained run as files that others open; see `FORMATS`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A page in the browser that shows a run, a recording or a depth prior, in space and time."""
+"""`d2 view` and `d2 train --view`: what to show, for how long, and the score of a training so far."""
 
 from __future__ import annotations
 

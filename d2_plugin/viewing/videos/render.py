@@ -1,4 +1,4 @@
-"""A video of a run: its held-out cameras, or a camera that moves; depth, errors, several runs together."""
+"""`d2 render`: a video of one run, or of several beside each other."""
 
 from __future__ import annotations
 
